@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE
 from zsched.core.scheduler.links import FORESEE_MOST_DB
 from zsched.core.scheduler.patience import CHOICES, FIRST_PATIENCE, spend
+from zsched.core.scheduler.scoring import REACH_MARGIN_DB
 from zsched.core.scheduler.utility import NEARLY_FULL
 from zsched.core.values.fleet import TaskSpec, Timing
 from zsched.core.values.gauges import BY_NAME
@@ -148,6 +149,9 @@ def _links(spec: TaskSpec) -> Iterator[str]:
     """What a signal is worth; of nodes on cables it says nothing."""
     limits = spec.limits
     yield f"a robot does not reach a candidate whose signal is below {limits.nu_dbm:g} dBm (link.nu_dbm)"
+    if spec.tuning.score is ScoreForm.SERVICE:
+        least = f"{limits.nu_dbm + REACH_MARGIN_DB:g} dBm"
+        yield f"while it reaches the owner, others count from {least} on, so a signal at its limit moves a task once"
     if spec.tuning.weights.network > 0.0:
         yield f"a signal is worth 0 at {limits.nu_dbm:g} dBm and 1 from {limits.rho_dbm:g} dBm on (link.rho_dbm)"
         yield f"through one access point {_PAIR[limits.pair]} counts (link.pair: {limits.pair})"

@@ -1182,7 +1182,7 @@ VOTE_BUGS = (
     _bug(
         "an owner that is gone leaves its memory's veto behind",
         SCORING,
-        "needed = demand if has_owner and candidate != owner else spec.demand",
+        "needed = demand if is_comer else spec.demand",
         "needed = demand",
         ("tests/unit/core/scheduler/test_scoring.py",),
     ),

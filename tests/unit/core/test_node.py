@@ -1190,6 +1190,7 @@ def test_profiles_are_echoed_in_a_fleet_with_a_deadline_and_only_there() -> None
         (own,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 101.02), do.PublishProfile)
         found = [(one.node, one.sequence, round(one.held_s, 3)) for one in own.profile.echoes]
         assert found == ([("edge1", heard.sequence, 0.5)] if is_echoed else [])
+        assert own.is_news is is_echoed, "one that waited for the hearer's next deadline would tell of that, too"
         assert {name: round(far_s, 3) for name, far_s in node.round_trips.seconds().items()} == (
             {"edge1": 0.02} if is_echoed else {}
         )
@@ -1223,6 +1224,13 @@ def test_profiles_are_echoed_where_an_operator_has_set_a_deadline(*, is_known: b
     assert {name: round(far_s, 3) for name, far_s in node.round_trips.seconds().items()} == {"edge1": 0.2}
     (own,) = of(node.handle(ev.ProfileSampled(device=SAMPLE), 102.3), do.PublishProfile)
     assert [one.node for one in own.profile.echoes] == ["edge1"]
+
+
+def test_a_drained_node_is_known_to_keep_nothing() -> None:
+    node = started()
+    assert node._doubts(FLEET.tasks[0], 100.0).drained == frozenset()
+    node.flags.drained = {"edge1": "drained by ada"}
+    assert node._doubts(FLEET.tasks[0], 100.0).drained == {"edge1"}
 
 
 def test_links_that_begin_and_cease_to_hold_beats_up_are_in_the_story() -> None:

@@ -31,6 +31,8 @@ SETTLE_S = 4.0
 """After a move, or a worker's start, the smoothed use rises for so long: it is only a lower bound of the need."""
 SHOWS_S: Final = 0.5
 """By this time constant a machine's figures show a task that has come: that of their means, and their way here."""
+HOLDS_ALL_S: Final = 60.0
+"""After so long with its task a worker has taken the memory that it works with."""
 COMPARED_S = 12.0
 """What differs so soon after a move is the machine's doing; what changes later is the task's."""
 RECENT_S = 60.0
@@ -258,6 +260,11 @@ class Demands:
         if known.owner != node:
             return 1.0 if known.is_unplaced or known.seen_at not in (None, node) else 0.0
         return 0.0 if known.before is None else math.exp((known.since - now) / shows_s)
+
+    def holds_all(self, task: TaskId, node: NodeId, now: float) -> bool:
+        """Whether the task's worker there has had it for so long that it holds the memory that it works with."""
+        known = self._known.get(task, _Known())
+        return known.owner == node and now - known.since >= HOLDS_ALL_S
 
     def speed(self, task: TaskId, profile: Profile) -> float:
         """The task's speed on a node, > 0: the benchmark's, or what was seen when the task came there."""

@@ -47,7 +47,7 @@ def taken(
         if profile is None:
             continue
         own = own_use(spec, values[spec.name], profile, spec.demand)
-        use = predicted(profile, own, spec.demand, coming_use(spec, profile, bookings, gateway, now))
+        use = predicted(profile, own, spec.demand, coming_use(spec, profile, bookings, gateway, now, own))
         if why := lacks_memory(profile, spec.demand.memory_mb, use):
             others = ", ".join(sorted(name for name, node in coming.items() if node == candidate))
             found[candidate] = f"{others} goes there now: {why}"

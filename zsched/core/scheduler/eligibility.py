@@ -12,7 +12,7 @@ from zsched.core.scheduler.usage import Use
 from zsched.core.values.fleet import Standby, TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.model import Allocation, PeerState
-from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.words import GaugeName
 
 _NEEDS = "needs "
@@ -35,6 +35,19 @@ def has_living_owner(spec: TaskSpec, owner_state: PeerState, profile: Profile | 
     """
     is_down = profile is not None and profile.has_failed(spec.name)
     return (owner_state is PeerState.ALIVE or is_spared) and not is_down
+
+
+def may_return(spec: TaskSpec, profile: Profile | None) -> bool:
+    """Whether a task that left its owner might soon come back, for all that the owner tells: then margins count.
+
+    Not to one that stops or gives it away, or whose worker is not ready. ``profile``: its newest fresh one.
+    """
+    if profile is None:
+        return True
+    load = profile.worker(spec.name)
+    if load is None:
+        return not profile.draining and not spec.worker.command
+    return not profile.draining and load.state is WorkerState.READY and load.renewal is not Renewal.LEAVES
 
 
 def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
@@ -60,8 +73,8 @@ def refusal(
 ) -> str:
     """Why the node may not have the task; empty when it may.
 
-    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``. ``has_owner``: a living one
-    has the task, from which it could move back.
+    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``. ``has_owner``: one has the
+    task to which it could move back (`may_return`).
     """
     if profile.draining:
         return "draining"

@@ -36,14 +36,23 @@ class PairLink(Struct, frozen=True):
 
     is_reached: bool
     utility: float
+    is_direct: bool = True
+    """Measured between the two; otherwise the robot's own way to the access point or the cable is a part of it."""
 
 
 def pair_link(
-    voter: NodeId, candidate: NodeId, gateway: Gateway, limits: LinkLimits, now: float, margin_db: float = 0.0
+    voter: NodeId,
+    candidate: NodeId,
+    gateway: Gateway,
+    limits: LinkLimits,
+    now: float,
+    margin_db: float = 0.0,
+    own_margin_db: float = 0.0,
 ) -> PairLink | None:
     """Eq. 3 for one (robot, candidate) pair, or ``None`` when nobody measured it.
 
-    A candidate is reached from ``margin_db`` above nu on (docs/decisions/0130).
+    A candidate is reached from ``margin_db`` above nu on, the access point by the robot's own radio from
+    ``own_margin_db`` above it (docs/decisions/0130).
 
     A link measured between the two counts as it is, from either end. Else both reach each other through one access
     point, and ``limits.pair`` says how the two ways become one.
@@ -51,6 +60,7 @@ def pair_link(
     if voter == candidate:
         return PairLink(is_reached=True, utility=1.0)
     ends, least_dbm = (gateway.fresh(voter, now), gateway.fresh(candidate, now)), limits.nu_dbm + margin_db
+    own_least_dbm = limits.nu_dbm + own_margin_db
     for end, other in ((ends[0], candidate), (ends[1], voter)):
         direct = None if end is None else _way(end, other, limits)
         if direct is not None:
@@ -60,8 +70,8 @@ def pair_link(
     own, its = _way(ends[0], None, limits), _way(ends[1], None, limits)
     if own is None or its is None:
         return None
-    is_reached = min(own.now_dbm, its.now_dbm) >= least_dbm
-    return PairLink(is_reached=is_reached, utility=_joint(own, its, limits))
+    is_reached = own.now_dbm >= own_least_dbm and its.now_dbm >= least_dbm
+    return PairLink(is_reached=is_reached, utility=_joint(own, its, limits), is_direct=False)
 
 
 def _joint(own: Way, its: Way, limits: LinkLimits) -> float:

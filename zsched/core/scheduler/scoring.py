@@ -13,7 +13,7 @@ from collections.abc import Set as AbstractSet
 from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
-from zsched.core.scheduler.eligibility import has_living_owner, refusal
+from zsched.core.scheduler.eligibility import has_living_owner, may_return, refusal
 from zsched.core.scheduler.links import pair_link, ways
 from zsched.core.scheduler.usage import Bookings, Use, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
@@ -76,6 +76,8 @@ class Doubts(Struct, frozen=True, kw_only=True):
     """{candidate: why it may not get the task} of those that were gone (`zsched.core.scheduler.probation`)."""
     unseen: AbstractSet[NodeId] = frozenset()
     """Not reached by this robot's streams, though by its questions (`zsched.core.scheduler.unseen`)."""
+    drained: AbstractSet[NodeId] = frozenset()
+    """They hand over what they have, by an operator's order: an owner among them does not get its task back."""
     unfit: Mapping[NodeId, str] = field(default_factory=dict)
     """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
 
@@ -115,16 +117,17 @@ def score(
     if allocation.tuning.deadline_ms is not None:
         away_s = ways(voter, spec.candidates, round_trips, gateway, now)
     owner = allocation.owner
+    told = None if owner is None else gateway.fresh(owner, now)
     has_owner = owner is not None and has_living_owner(
-        spec,
-        states.get(owner, PeerState.UNKNOWN),
-        gateway.fresh(owner, now),
-        is_spared=owner in doubts.in_grace,
+        spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace
     )
+    is_kept = has_owner and owner not in doubts.drained and may_return(spec, told)
     of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
-    margin_db = 0.0
-    if has_owner and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:
+    margin_db = own_margin_db = 0.0
+    if is_kept and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:
         margin_db = REACH_MARGIN_DB if of_owner is None or of_owner.is_reached else 0.0
+        # the way to the access point takes no part in who is better where the owner is reached by it, too
+        own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
@@ -144,18 +147,20 @@ def score(
         if profile is None:
             refused.append((candidate, "no fresh profile"))
             continue
-        demand, coming = gateway.demand(spec, profile), coming_use(spec, profile, bookings, gateway, now)
+        demand, is_comer = gateway.demand(spec, profile), has_owner and candidate != owner
         own = own_use(spec, allocation, profile, demand)
+        coming = coming_use(spec, profile, bookings, gateway, now, None if is_comer else own)
         use = predicted(profile, own, demand, coming)
         gauges = predicted_gauges(spec, allocation, profile, bookings, gateway, now)
-        needed = demand if has_owner and candidate != owner else spec.demand
+        needed = demand if is_comer else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
-        reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, has_owner=has_owner)
+        reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, has_owner=is_kept)
         if reason:
             refused.append((candidate, reason))
             continue
-        is_kept = has_owner and candidate == owner
-        link = of_owner if is_kept else pair_link(voter, candidate, gateway, spec.limits, now, margin_db)
+        link = of_owner
+        if not has_owner or candidate != owner:
+            link = pair_link(voter, candidate, gateway, spec.limits, now, margin_db, own_margin_db)
         if link is not None and not link.is_reached:
             unreachable.append(candidate)
             continue

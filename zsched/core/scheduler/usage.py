@@ -38,17 +38,31 @@ def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Book
     return booked
 
 
-def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> Demand:
+def coming_use(
+    spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float, own: Demand | None
+) -> Demand:
     """What other tasks will use on a node beyond what its profile shows of their workers.
 
     Of a worker that somebody else started no profile says what it uses. What it brings from another node is coming as
     far as the machine's means do not show it yet. What a worker visibly lacks on a full machine is no coming use: it
     will not get it there while that lasts.
+
+    Memory that a worker holds and no process shows (a GPU's, where that is the machine's) is in use and would count
+    twice. How much of what a task asks for is held like that nobody measures: at most what the machine has in use
+    beyond the workers' processes. That much is not reserved against a task that has no other place.
+
+    Args:
+        spec: the task that is to be there.
+        profile: the node's.
+        bookings: which tasks nodes have.
+        gateway: what tasks need.
+        now: monotonic seconds.
+        own: what of the node's use is the task's own; ``None``: it has a place elsewhere, so it can wait for room.
     """
     others = () if bookings is None else bookings.get(profile.node, ())
     if not others:
         return _NOTHING
-    cpu = memory = 0.0
+    cpu = memory = hidden_mb = 0.0
     for other in others:
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
@@ -57,8 +71,23 @@ def coming_use(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gate
             unshown = 1.0 if other.worker.command else gateway.demands.unshown_ratio(other.name, profile.node, now)
             if not (is_full(profile) and is_short(load)):
                 cpu += unshown * max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
-            memory += unshown * max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
+            unshown_mb = unshown * max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
+            is_working = other.worker.command and load.state is WorkerState.READY
+            if own is not None and is_working and gateway.demands.holds_all(other.name, profile.node, now):
+                hidden_mb += unshown_mb
+            else:
+                memory += unshown_mb
+    if own is not None and hidden_mb > 0.0:
+        memory += max(hidden_mb - _unseen_mb(spec, profile, own), 0.0)
     return Demand(cpu_cores=min(cpu, MAX_CPU_CORES), memory_mb=min(memory, MAX_MEMORY_MB))
+
+
+def _unseen_mb(spec: TaskSpec, profile: Profile, own: Demand) -> float:
+    """Memory in use that no worker's processes show, without the task's ``own``."""
+    shown_mb = sum(load.memory_mb or 0.0 for load in profile.workers)
+    load = profile.worker(spec.name)
+    own_mb = max(own.memory_mb - (0.0 if load is None else load.memory_mb or 0.0), 0.0)
+    return max((profile.memory_used_mb or 0.0) - shown_mb - own_mb, 0.0)
 
 
 class Use(Struct, frozen=True):

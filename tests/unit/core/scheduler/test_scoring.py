@@ -268,6 +268,47 @@ def test_who_reaches_the_owner_reaches_another_candidate_from_a_margin_on(
 
 
 @pytest.mark.parametrize(
+    ("owner", "drained", "is_reached"),
+    [
+        ({}, (), False),
+        ({}, ("edge1",), True),
+        ({"draining": True}, (), True),
+        ({"state": WorkerState.STARTING}, (), True),
+        ({"state": None}, (), True),
+    ],
+)
+def test_an_owner_that_the_task_cannot_return_to_asks_for_no_margin(
+    owner: dict[str, Any], drained: tuple[str, ...], *, is_reached: bool
+) -> None:
+    """A weak link is better than none, and a machine that is nearly out of its limits better than a drained one."""
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
+    agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    edges = (
+        profile("edge1", **owner),
+        profile("edge2", links=radio(-79.0)),
+        replace(profile("edge3"), gauges=(("battery", 0.23),)),
+    )
+    vector = scored(ROBOT, *edges, spec=spec, agreed=agreed, doubts=Doubts(drained=frozenset(drained)))
+    (weak,) = (one for one in vector.utilities if one.candidate == "edge2")
+    assert weak.reachable is is_reached
+    assert ("edge3" not in dict(vector.refused)) is is_reached
+
+
+def test_a_weak_way_to_the_access_point_that_leads_to_the_owner_too_sets_no_candidate_back() -> None:
+    """Both edges are reached by the same radio: it says nothing of which one is better."""
+    weak, edges = (
+        profile("robot1", links=radio(-78.5), state=None),
+        (profile("edge1", cpu=3.8), profile("edge2", cpu=0.1)),
+    )
+    agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    spec = replace(SPEC, candidates=("edge1", "edge2", "robot1"))
+    assert [one.reachable for one in scored(weak, *edges, spec=spec, agreed=agreed).utilities[:2]] == [True, True]
+    at_home = replace(agreed, owner="robot1")
+    home = replace(weak, workers=(load_of(),))
+    assert [one.reachable for one in scored(home, *edges, spec=spec, agreed=at_home).utilities[:2]] == [False, False]
+
+
+@pytest.mark.parametrize(
     ("candidate", "reason"),
     [
         (profile("edge2", draining=True), "draining"),

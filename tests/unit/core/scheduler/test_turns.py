@@ -145,6 +145,35 @@ def test_memory_that_is_booked_cannot_be_had_twice() -> None:
     assert dict(vector.refused) == {"edge1": "needs 800 MiB, has 400 free"}
 
 
+@pytest.mark.parametrize(
+    ("owner_of_b", "owner_state", "held_s", "refused"),
+    [
+        ("edge2", PeerState.GONE, 60.0, {}),
+        ("edge1", PeerState.ALIVE, 60.0, {}),
+        (None, PeerState.ALIVE, 60.0, {}),
+        ("edge2", PeerState.GONE, 59.0, {"edge1": "needs 800 MiB, has 0 free"}),
+        ("edge2", PeerState.ALIVE, 60.0, {"edge1": "needs 800 MiB, has 0 free"}),
+    ],
+)
+def test_memory_that_another_worker_holds_and_no_process_shows_leaves_no_task_without_a_place(
+    owner_of_b: str | None, owner_state: PeerState, held_s: float, refused: dict[str, str]
+) -> None:
+    """A board whose GPU uses the machine's memory: a asks for 3000 MiB, and 500 of them show."""
+    large = replace(A, demand=Demand(memory_mb=3000.0))
+    gateway = Gateway(fleet_of(large, B, of=("edge1", "edge2"), electors=("robot1",)))
+    workers = (load_of("a", cpu_cores=0.1, memory_mb=500.0), load_of("b", cpu_cores=0.0, memory_mb=50.0))
+    at_home = profile_of(memory_mb=6500.0, memory_used_mb=1500.0 + 3000.0, workers=workers)
+    away = profile_of("edge2", memory_mb=6500.0, workers=(load_of("b", cpu_cores=0.0, memory_mb=50.0),))
+    for sequence, now in enumerate((0.0, held_s)):
+        for one in (at_home, away):
+            gateway.absorb(replace(one, sequence=sequence), now)
+        gateway.learn_demand("a", "edge1", now)
+    agreed = values("edge1", owner_of_b)
+    states = {**ALIVE, "edge2": owner_state} if owner_of_b == "edge2" else ALIVE
+    vector = score(B, agreed["b"], "robot1", gateway, states, held_s, book((large, B), agreed))
+    assert dict(vector.refused) == refused
+
+
 STARVED = Demand(cpu_cores=2.0, memory_mb=100.0)
 TUNING = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE)
 STARVED_A, STARVED_B = (
