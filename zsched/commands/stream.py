@@ -265,7 +265,7 @@ def _print_rates(view: StreamView, verb: str, found: dict[tuple[str, str], KeySt
         where = f"{key} ({side} side)" if side != "fleet" else key
         say(f"{where}: {_hz_text(row) if verb == 'hz' else _bw_text(row)}")
     if missed:
-        say(f"... {missed} more samples came faster than they could be counted")
+        say(f"... at least {missed} more samples came faster than they could be counted")
 
 
 def _hz_text(row: Json) -> str:
@@ -283,12 +283,16 @@ def _bw_text(row: Json) -> str:
 def show_tail(view: StreamView, word: str | None) -> int:
     """Print each sample as it comes; returns the exit code: 1 when the time was over before the first one."""
     seen = 0
-    with _tap(view, word) as tap:
-        for sample in _samples(tap, view.timeout_s):
-            _print_sample(view, sample)
-            seen += 1
-            if view.count is not None and seen >= view.count:
-                break
+    with _tap(view, word, PREVIEW) as tap:
+        try:
+            for sample in _samples(tap, view.timeout_s):
+                _print_sample(view, sample)
+                seen += 1
+                if view.count is not None and seen >= view.count:
+                    break
+        finally:
+            if tap.missed:
+                warn(f"zsched stream: at least {tap.missed} samples came faster than they could be printed")
     return EXIT_OK if seen else EXIT_FAILED
 
 
@@ -301,7 +305,7 @@ def _samples(tap: StreamTap, timeout_s: float | None) -> Iterator[Tapped]:
 
 
 def _print_sample(view: StreamView, sample: Tapped) -> None:
-    head = sample.payload.to_bytes()[:PREVIEW]
+    head = sample.payload[:PREVIEW]
     if view.is_json:
         body: Json = {
             "schema": "zsched.stream.tail/1",
@@ -330,8 +334,8 @@ def _shown(head: bytes) -> str:
     return text if text.isprintable() else head.hex(" ")
 
 
-def _tap(view: StreamView, word: str | None) -> StreamTap:
-    """A tap on the keys that ``word`` means at the node that is asked.
+def _tap(view: StreamView, word: str | None, kept_bytes: int = 0) -> StreamTap:
+    """A tap on the keys that ``word`` means at the node that is asked; it keeps so much of each payload.
 
     Raises:
         CliError: no daemon (3), no way to the node's data (3), no such stream or key (1, 2), a node of a cell (2).
@@ -347,7 +351,7 @@ def _tap(view: StreamView, word: str | None) -> StreamTap:
     from zsched.adapters.network.stream_tap import StreamTap  # noqa: PLC0415 - loads zenoh, which only these verbs need
 
     try:
-        return StreamTap(sides, keys)
+        return StreamTap(sides, keys, kept_bytes=kept_bytes)
     except AdapterError as error:
         ways: Sequence[Any] = access["endpoints"]
         raise CliError(EXIT_UNREACHABLE, f"{', '.join(map(str, ways))}: {error}") from error

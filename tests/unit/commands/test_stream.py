@@ -9,7 +9,6 @@ from types import SimpleNamespace
 from typing import Any, Self
 
 import pytest
-import zenoh
 from typer.testing import CliRunner
 
 from support.fleets import fleet_of, node_of
@@ -243,7 +242,7 @@ def test_a_message_is_printed_as_its_schema_says(capsys: pytest.CaptureFixture[s
         side="fleet",
         key="robot1/in",
         at=1.0,
-        payload=zenoh.ZBytes(b"hello"),
+        payload=b"hello",
         size=5,
         encoding="text/plain",
         kind="put",

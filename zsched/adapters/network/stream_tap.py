@@ -1,13 +1,17 @@
 """Listens to keys of the data network for a while: a client session of its own, beside everybody else's.
 
 Knows: zenoh sessions and subscribers, arrival times. Does not know: nodes, streams, what is made of the samples.
+
+Who only looks must not hold up what he looks at: what comes faster than it is taken is dropped here, and counted. What
+waits for a reader that stands still (a terminal that is held, a pager) is bounded in number and in bytes.
 """
 
 from __future__ import annotations
 
 import contextlib
-import queue
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -19,8 +23,11 @@ from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 from zsched.guard import ends_within, guarded
 
+RING: Final = 100_000
+"""Samples that zenoh keeps for our thread; beyond it the oldest go, and zenoh does not say how many."""
 DEPTH: Final = 10_000
-"""Samples that may wait for the reader; beyond it the oldest go, and `StreamTap.missed` stays honest."""
+HELD_BYTES: Final = 32 << 20
+"""Samples, and bytes of theirs, that may wait for the reader; newer ones are dropped and counted."""
 CLOSE_S: Final = 0.5
 """Closing a session towards a stopped peer can take seconds; we wait for at most this long."""
 
@@ -35,7 +42,8 @@ class Tapped(Struct, frozen=True, kw_only=True):
     kind: str
     encoding: str
     attachment_size: int
-    payload: zenoh.ZBytes
+    payload: bytes
+    """As much of it as the tap keeps."""
     source: str = ""
     """Which publisher's it is: what the sample says of it, by zenoh's own means or rmw_zenoh's; empty: nothing."""
 
@@ -43,14 +51,23 @@ class Tapped(Struct, frozen=True, kw_only=True):
 class StreamTap:
     """Subscribers on one session per side. A context manager: leaving it closes the sessions."""
 
-    def __init__(self, sides: Mapping[str, str], keys: Sequence[str]) -> None:
-        """Open the sessions (``sides``: name -> zenoh configuration as JSON) and subscribe to ``keys``.
+    def __init__(self, sides: Mapping[str, str], keys: Sequence[str], *, kept_bytes: int | None = 0) -> None:
+        """Open the sessions and subscribe.
+
+        Args:
+            sides: {name: zenoh configuration as JSON}.
+            keys: key expressions.
+            kept_bytes: so much of each payload is kept; ``None``: all of it.
 
         Raises:
             AdapterError: a session cannot be opened, or a key is none.
         """
         self.missed = 0
-        self._samples: queue.Queue[Tapped] = queue.Queue(DEPTH)
+        """Samples that came faster than they could be taken, at least."""
+        self._kept_bytes = kept_bytes
+        self._samples: deque[Tapped] = deque()
+        self._held_bytes = 0
+        self._came = threading.Condition()
         self._sessions: list[zenoh.Session] = []
         self._subscribers: list[Any] = []
         try:
@@ -64,14 +81,15 @@ class StreamTap:
         session = zenoh.open(zenoh.Config.from_json5(config))
         self._sessions.append(session)
         for key in keys:
-            # a channel and a thread of ours: a callback's thread would hold the process at its end
-            subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(DEPTH))
+            # a channel and a thread of ours: a callback's thread would hold the process at its end, and a channel
+            # that is full would hold up the relay
+            subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(RING))
             self._subscribers.append(subscriber)
             guarded(self._run, side, subscriber.handler, name=f"tap {key}", kind="tap").start()
 
     def _run(self, side: str, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-        for sample in handler:
-            attachment = sample.attachment
+        for sample in _each(handler, self._note_overflow):
+            attachment, payload = sample.attachment, sample.payload.to_bytes() if self._kept_bytes != 0 else b""
             tapped = Tapped(
                 side=side,
                 key=str(sample.key_expr),
@@ -80,21 +98,37 @@ class StreamTap:
                 kind="delete" if sample.kind == zenoh.SampleKind.DELETE else "put",
                 encoding=str(sample.encoding),
                 attachment_size=0 if attachment is None else len(attachment),
-                payload=sample.payload,
+                payload=payload[: self._kept_bytes],
                 source=_source(sample),
             )
-            try:
-                self._samples.put_nowait(tapped)
-            except queue.Full:
+            self._put(tapped)
+
+    def _put(self, tapped: Tapped) -> None:
+        with self._came:
+            # one sample may be larger than all that is held
+            is_full = len(self._samples) >= DEPTH or self._held_bytes + len(tapped.payload) > HELD_BYTES
+            if self._samples and is_full:
                 self.missed += 1
+                return
+            self._samples.append(tapped)
+            self._held_bytes += len(tapped.payload)
+            self._came.notify()
+
+    def _note_overflow(self) -> None:
+        with self._came:
+            self.missed += 1
 
     def until(self, end: float) -> Iterator[Tapped]:
         """What comes until ``end`` (`monotonic_s`), in order of arrival."""
         while (left := end - monotonic_s()) > 0:
-            try:
-                yield self._samples.get(timeout=left)
-            except queue.Empty:
-                return
+            with self._came:
+                if not self._samples and not self._came.wait(left):
+                    return
+                if not self._samples:
+                    continue
+                tapped = self._samples.popleft()
+                self._held_bytes -= len(tapped.payload)
+            yield tapped
 
     def close(self) -> None:
         """Close the sessions, within `CLOSE_S`."""
@@ -112,6 +146,27 @@ class StreamTap:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _each(handler: zenoh.handlers.Handler[zenoh.Sample], on_overflow: Callable[[], None]) -> Iterator[zenoh.Sample]:
+    """Each sample as it comes; calls ``on_overflow`` where the ring may have dropped some.
+
+    It drops only while it is full, and what it is full of is taken in a row then, without finding it empty.
+    """
+    in_a_row = 0
+    while True:
+        try:
+            sample = handler.try_recv()
+            if sample is None:
+                in_a_row = 0
+                sample = handler.recv()
+        except zenoh.ZError:
+            return  # undeclared
+        in_a_row += 1
+        if in_a_row >= RING:
+            in_a_row = 0
+            on_overflow()
+        yield sample
 
 
 def _source(sample: zenoh.Sample) -> str:

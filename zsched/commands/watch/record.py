@@ -91,7 +91,11 @@ def record(view: RecordView) -> int:
             news = feed.ask()
             away.tell(news.why or news.log_why)
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
-    missed = f"; {tap.missed} samples came faster than they could be written" if tap is not None and tap.missed else ""
+    missed = (
+        f"; at least {tap.missed} samples came faster than they could be written"
+        if tap is not None and tap.missed
+        else ""
+    )
     warn(f"{told}{missed}")
     return EXIT_OK
 
@@ -104,7 +108,7 @@ def _wait(until: float, tap: StreamTap | None, tape: Tape, ended: Latch) -> None
     while not ended.is_set() and (now := monotonic_s()) < until:
         for sample in tap.until(min(now + 0.2, until)):
             if sample.kind == "put" and sample.side == "fleet":
-                tape.put_ros(sample.key, sample.payload.to_bytes(), wall_s() - (monotonic_s() - sample.at))
+                tape.put_ros(sample.key, sample.payload, wall_s() - (monotonic_s() - sample.at))
 
 
 def _ros_keys(status: Json, view: RecordView) -> dict[str, str]:
@@ -124,7 +128,7 @@ def _tapped(door: Door, keys: tuple[str, ...]) -> Iterator[StreamTap | None]:
     from zsched.adapters.network.stream_tap import StreamTap  # noqa: PLC0415 - loads zenoh, which only these need
 
     try:
-        tap = StreamTap({"fleet": access["sides"]["fleet"]}, keys)
+        tap = StreamTap({"fleet": access["sides"]["fleet"]}, keys, kept_bytes=None)
     except AdapterError as error:
         raise CliError(EXIT_UNREACHABLE, f"maps and frames cannot be listened to: {error}") from error
     with tap:
