@@ -91,11 +91,9 @@ def record(view: RecordView) -> int:
             news = feed.ask()
             away.tell(news.why or news.log_why)
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
-    missed = (
-        f"; at least {tap.missed} samples came faster than they could be written"
-        if tap is not None and tap.missed
-        else ""
-    )
+    missed = ""
+    if tap is not None and tap.missed:
+        missed = f"; at least {tap.missed} samples came faster than they could be written"
     warn(f"{told}{missed}")
     return EXIT_OK
 
