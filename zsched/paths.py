@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 SYSTEM_CONFIG = Path("/etc/zsched/fleet.yaml")
 SYSTEM_RUNTIME = Path("/run/zsched")
+SYSTEM_STATE = Path("/var/lib/zsched")
 SESSION_SUFFIX = ".zenoh.json5"
 """Of a worker's session file, ``<node>-<task>`` before it; other files of the worker stand beside it."""
 PID_SUFFIX = ".pid"
@@ -47,14 +48,17 @@ def config_path(given: Path | None, env: Mapping[str, str]) -> Path:
 def is_there(file: Path) -> bool:
     """Whether a file exists, or is in a folder into which we may not look: there it is told when it is read."""
     try:
-        return file.exists()
+        os.stat(file)  # noqa: PTH116 - since Python 3.14 `exists` says of such a file that it is not there
     except PermissionError:
         return True
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def state_folder(given: Path | None, env: Mapping[str, str]) -> Path:
     """The state folder: the argument, ``ZSCHED_STATE_DIR``, systemd's, ``/var/lib/zsched`` or the user's own."""
-    return _folder(given, env, "ZSCHED_STATE_DIR", "STATE_DIRECTORY", Path("/var/lib/zsched"), "XDG_STATE_HOME")
+    return _folder(given, env, "ZSCHED_STATE_DIR", "STATE_DIRECTORY", SYSTEM_STATE, "XDG_STATE_HOME")
 
 
 def runtime_folder(given: Path | None, env: Mapping[str, str]) -> Path:
@@ -65,11 +69,26 @@ def runtime_folder(given: Path | None, env: Mapping[str, str]) -> Path:
 def asked_folder(given: Path | None, env: Mapping[str, str], system: Path = SYSTEM_RUNTIME) -> Path:
     """Where a tool looks for a daemon: as `runtime_folder`, but the service's where there is none of theirs.
 
+    Into the service's folder a user may not look who is not in its group: what is there tells then to ask as root.
+
     ``system``: but in tests the service's folder.
     """
     own = runtime_folder(given, env)
     is_told = given is not None or bool(env.get("ZSCHED_RUNTIME_DIR"))
-    return system if not is_told and not local_sockets(own) and local_sockets(system) else own
+    if is_told or local_sockets(own):
+        return own
+    return system if local_sockets(system) or is_closed(system) else own
+
+
+def asked_state_folder(
+    given: Path | None, env: Mapping[str, str], runtime: Path, system: Path = SYSTEM_RUNTIME
+) -> Path:
+    """Where the state of a daemon is that a tool has found in ``runtime``: the service's has the service's state.
+
+    ``system``: but in tests the service's folder.
+    """
+    is_told = given is not None or bool(env.get("ZSCHED_STATE_DIR"))
+    return SYSTEM_STATE if not is_told and runtime == system else state_folder(given, env)
 
 
 def authority_folder(given: Path | None, env: Mapping[str, str], fleet: str) -> Path:

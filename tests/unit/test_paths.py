@@ -104,3 +104,18 @@ def test_who_asks_finds_the_service_where_no_daemon_of_theirs_runs(tmp_path: Pat
         assert places.asked_folder(None, told, system) == places.asked_folder(own, env, system) == own
         (own / "robot2.sock").touch()
         assert places.asked_folder(None, env, system) == own, "their own come first"
+        (own / "robot2.sock").unlink()
+        (system / "robot1.sock").unlink()
+        with patch("zsched.paths.is_closed", return_value=True):
+            assert places.asked_folder(None, env, system) == system, "nobody may look into it: a daemon may be there"
+
+
+def test_the_state_of_a_service_that_a_user_asks_is_the_services(tmp_path: Path) -> None:
+    own, system = tmp_path / "user" / "zsched", tmp_path / "run"
+    env = {"XDG_STATE_HOME": str(tmp_path / "user")}
+    with patch("os.geteuid", return_value=1000):
+        assert places.asked_state_folder(None, env, system, system) == Path("/var/lib/zsched")
+        assert places.asked_state_folder(None, env, own, system) == own
+        assert places.asked_state_folder(GIVEN, env, system, system) == GIVEN
+        told = {**env, "ZSCHED_STATE_DIR": str(own)}
+        assert places.asked_state_folder(None, told, system, system) == own

@@ -38,10 +38,11 @@ def machine_of(config: Path | None, node: str | None, state_dir: Path | None, ru
     Raises:
         CliError: several daemons run here, and nothing says which is meant.
     """
+    runtime = places.asked_folder(runtime_dir, os.environ)
     return Machine(
         file=places.config_path(config, os.environ),
-        state_folder=places.state_folder(state_dir, os.environ),
-        runtime_folder=places.asked_folder(runtime_dir, os.environ),
+        state_folder=places.asked_state_folder(state_dir, os.environ, runtime),
+        runtime_folder=runtime,
         node=name_here(node, runtime_dir),
     )
 

@@ -16,6 +16,7 @@ from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 from zsched.errors import InvariantError
+from zsched.paths import is_there
 
 Json: TypeAlias = dict[str, Any]
 
@@ -168,7 +169,7 @@ class Scene(Struct, frozen=True, kw_only=True):
     @property
     def is_visit(self) -> bool:
         """Whether this is no node of the fleet, such as an operator's laptop: then only the fleet is looked at."""
-        is_bare = self.own is None and not self.state_folder.exists()
+        is_bare = self.own is None and not is_there(self.state_folder)
         return self.is_fleet and self.known is not None and not self.is_node and is_bare
 
     def at(self, path: str | Path) -> Path:

@@ -15,6 +15,7 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import electorate_hash
 from zsched.doctor.model import SEAT_ADVICE, Result, Scene, failed, passed, skipped, warned
+from zsched.paths import is_there
 
 SYNC_TRIES: Final = 5
 SLOW_SYNC_S: Final = 0.05
@@ -72,7 +73,7 @@ def makes_an_elector(scene: Scene) -> Result:
 def syncs_quickly(scene: Scene) -> Result:
     """Whether a save in the state folder is on disk soon enough for a ballot."""
     folder = scene.state_folder
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
+    if not os.access(folder, os.W_OK | os.X_OK):
         return skipped(f"{folder} is not there, or not to be written by user {os.geteuid()}")
     try:
         took_s = _sync_s(folder)
@@ -109,7 +110,9 @@ def _sync_s(folder: Path) -> float:
 
 def has_space(scene: Scene) -> Result:
     """Whether the state folder's disk has room and may be written."""
-    folder = next((one for one in (scene.state_folder, *scene.state_folder.parents) if one.exists()), Path("/"))
+    folder = next(
+        (one for one in (scene.state_folder, *scene.state_folder.parents) if os.access(one, os.X_OK)), Path("/")
+    )
     facts = os.statvfs(folder)
     return judged_space(
         folder,
@@ -132,7 +135,4 @@ def judged_space(folder: Path, *, free: int, files: int | None, is_read_only: bo
 
 def is_hidden(folder: Path) -> bool:
     """Whether this user may not see what is in the folder."""
-    try:
-        return folder.exists() and not os.access(folder, os.R_OK | os.X_OK)
-    except OSError:
-        return True
+    return is_there(folder) and not os.access(folder, os.R_OK | os.X_OK)
