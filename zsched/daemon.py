@@ -45,7 +45,7 @@ from zsched.core.values.snapshot import Exposure
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
-from zsched.guard import on_failure
+from zsched.guard import calmed, on_failure
 from zsched.heap import Leftovers, give_back, share_heaps
 from zsched.ipc.takeover import Door
 from zsched.log_limit import log_to_stderr
@@ -470,6 +470,8 @@ class Daemon:
             if now >= self._next_status:
                 self._next_status = now + 1.0
                 self._leftovers.tend(now)
+                for kind in calmed(now):
+                    self._inbox.post(ev.ProblemReported(source=f"thread/{kind}", problem=None))
                 self._notify.status(status_line(node))
 
     def _end_to_begin_anew(self) -> None:

@@ -5,7 +5,8 @@ Knows: what happens when a thread's function raises. Does not know: what threads
 An exception, a `SystemExit` too (a thread of Python's own ends by it without a word), is logged with its stack,
 counted under the thread's name, and reported to `on_failure` (the daemon and the relay show it in `status`). A thread
 that serves as long as its process lives (``is_lasting``) then begins again, after a pause that doubles while it keeps
-failing; one that has a single errand ends.
+failing; one that has a single errand ends. What has not failed again for ten minutes is no problem any more (`calmed`);
+its log line and its count stay.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ MAX_PAUSE_S: Final = 5.0
 CALM_S: Final = 60.0
 """A thread that has run for this long fails for the first time again."""
 
+TOLD_S: Final = 600.0
+"""A failure is told for so long, if no other one of its kind follows."""
 NAME_BYTES: Final = 15
 """The kernel keeps this much of a thread's name."""
 
@@ -38,6 +41,9 @@ _log = logging.getLogger("zsched.guard")
 
 failures: Counter[str] = Counter()
 """{kind of thread: how often one has failed} of this process."""
+
+_failed_at: dict[str, float] = {}
+"""{kind: when one failed last}, as long as that is told."""
 _listeners: list[Callable[[str, str], None]] = []
 
 
@@ -145,6 +151,7 @@ def _run(run: Callable[[], object], kind: str, *, is_lasting: bool) -> None:
 def note(kind: str, error: BaseException) -> None:
     """Log, count and tell that something in a thread has failed."""
     failures[kind] += 1
+    _failed_at[kind] = monotonic_s()
     _log.error("thread %s failed (%d times so far)", kind, failures[kind], exc_info=error)
     text = f"a thread failed ({failures[kind]} times), last with {type(error).__name__}: {error}"[:400]
     for listener in _listeners:
@@ -152,3 +159,9 @@ def note(kind: str, error: BaseException) -> None:
             listener(kind, text)
         except Exception:  # noqa: BLE001 - who tells must not make it worse
             _log.exception("a failure could not be told")
+
+
+def calmed(now: float) -> tuple[str, ...]:
+    """Kinds of which none has failed for `TOLD_S`, each once: who was told of them may be told that it is over."""
+    over = tuple((kind, at) for kind, at in tuple(_failed_at.items()) if now - at >= TOLD_S)
+    return tuple(kind for kind, at in over if _failed_at.get(kind) == at and _failed_at.pop(kind))

@@ -31,6 +31,7 @@ def told() -> Iterator[list[tuple[str, str]]]:
     yield heard
     guard._listeners[:] = before
     guard.failures.clear()
+    guard._failed_at.clear()
 
 
 EXAMPLES = PACKAGE / "examples"
@@ -41,6 +42,19 @@ def wait(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
+
+
+def test_a_failure_is_over_once_none_of_its_kind_has_followed_for_a_while(told: list[tuple[str, str]]) -> None:
+    for kind in ("one", "two"):
+        guard.note(kind, OSError("broken"))
+    began = time.monotonic()
+    assert guard.calmed(began + guard.TOLD_S - 60.0) == ()
+    assert guard.calmed(began + guard.TOLD_S + 60.0) == ("one", "two")
+    assert guard.calmed(began + guard.TOLD_S + 60.0) == (), "each once"
+    guard.note("one", OSError("broken"))
+    assert guard.calmed(time.monotonic() + guard.TOLD_S + 60.0) == ("one",)
+    assert guard.failures["one"] == 2, "its count stays"
+    assert len(told) == 3
 
 
 def test_every_thread_is_started_by_the_guard() -> None:

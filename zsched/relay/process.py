@@ -32,7 +32,7 @@ from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, Tas
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
 from zsched.errors import WireError
-from zsched.guard import ends_within, guarded, on_failure
+from zsched.guard import calmed, ends_within, guarded, on_failure
 from zsched.heap import give_back
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
@@ -431,6 +431,8 @@ class RelayProcess:
             pause.wait(due - awake_s())
             self._tell_counts()
             self._tell_refused()
+            for kind in calmed(monotonic_s()):
+                self._reporter.report(ProblemReported(source=_of_thread(kind), problem=None))
             is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
             if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
                 self._introducer.introduce()
@@ -443,6 +445,10 @@ class RelayProcess:
         counts = self._books.added(own)
         self._books.write(own, self._application.settled(own), is_last=is_last)
         self._reporter.report(StreamsCounted(counts=self._application.added(counts)))
+
+
+def _of_thread(kind: str) -> str:
+    return f"{SOURCE}/thread/{kind}"
 
 
 def _standbys_of(task: TaskId) -> str:
@@ -487,7 +493,7 @@ def run(
     ``parent`` is that daemon's process; 0: our parent's. It may be gone before we can ask who our parent is.
     """
     reporter = Reporter(reports)
-    on_failure(lambda kind, text: reporter.report(ProblemReported(source=f"{SOURCE}/thread/{kind}", problem=text)))
+    on_failure(lambda kind, text: reporter.report(ProblemReported(source=_of_thread(kind), problem=text)))
     text = read_frame(commands)
     local = read_frame(commands) if has_local_side else b""
     if text is None or local is None:
