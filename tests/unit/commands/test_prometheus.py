@@ -140,6 +140,16 @@ def test_what_is_taken_over_several_nodes_stays_within_a_fleet() -> None:
     assert all(labels & {"instance", "fleet"} for labels in kept)
 
 
+@pytest.mark.parametrize("alert", ["ZschedStreamDrops", "ZschedFramesDropped"])
+def test_a_count_that_is_there_for_the_first_time_is_seen(alert: str) -> None:
+    """What `rate` and `increase` see is a rise; a reason's first burst is none."""
+    (rule,) = [rule for rule in rules() if rule["alert"] == alert]
+    risen, appeared = rule["expr"].split(" or ")
+    assert re.search(r"(?:rate|increase)\((.+?)\[(\d+)m\]\)", risen)
+    counted, window = re.findall(r"(?:rate|increase)\((.+?)\[(\d+)m\]\)", risen)[0]
+    assert f"({counted} unless {counted.partition('{')[0]} offset {window}m) > " in appeared
+
+
 def test_a_node_that_was_never_heard_is_told_as_one_that_is_gone() -> None:
     (rule,) = [rule for rule in rules() if rule["alert"] == "ZschedNodeGone"]
     assert 'state=~"gone|unknown"' in rule["expr"]
