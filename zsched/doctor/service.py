@@ -28,6 +28,8 @@ FOLDERS: Final = ("/etc/systemd/system", "/run/systemd/system", "/usr/lib/system
 HOMES: Final = ("/home", "/root", "/run/user")
 """What `ProtectHome=yes` hides."""
 
+SYSTEMD_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin"
+"""``$PATH`` of a service that says nothing (systemd.exec(5))."""
 LINE_BYTES: Final = 512
 
 Settings = list[tuple[str, str]]
@@ -155,6 +157,16 @@ def user_of_service(scene: Scene) -> tuple[int, int] | None:
     if reader.uid == 0:
         return None
     return (reader.uid, reader.group) if reader.uid > 0 else (NOBODY, NOBODY)
+
+
+def path_of_service(scene: Scene) -> str | None:
+    """Where the daemon looks for programs, as ``PATH`` says it; ``None``: there is no unit."""
+    unit = _unit(scene)
+    if unit is None:
+        return None
+    told = (shlex.split(value) for name, value in _settings(scene, unit) if name == "Environment")
+    paths = [word.removeprefix("PATH=") for words in told for word in words if word.startswith("PATH=")]
+    return paths[-1] if paths else SYSTEMD_PATH
 
 
 def _key(scene: Scene, settings: Settings, reader: _Reader) -> Iterator[Result]:

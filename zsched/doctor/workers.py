@@ -17,7 +17,7 @@ from typing import Any, Final
 from zsched.core.values.fleet import TaskSpec, runs_worker
 from zsched.core.values.words import RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
-from zsched.doctor.service import user_of_service
+from zsched.doctor.service import path_of_service, user_of_service
 from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
 
@@ -41,14 +41,16 @@ def _mine(scene: Scene) -> Iterator[TaskSpec]:
 
 def commands_are_there(scene: Scene) -> Result:
     """Whether the program of each worker is there and may be run."""
-    found = [_command(task) for task in _mine(scene)]
+    found = [_command(task, path_of_service(scene)) for task in _mine(scene)]
     return joined(found, skipped("no worker is started by the daemon here"))
 
 
-def _command(task: TaskSpec) -> Result:
+def _command(task: TaskSpec, service_path: str | None) -> Result:
+    """``service_path``: where the service looks for programs; ``None``: the daemon is started by hand."""
     program, *words = task.worker.command
     fix = f"install it, or correct `worker: {{command:}}` of {task.name} (full paths)"
-    where = program if program in PYTHON else shutil.which(program, path=dict(task.worker.env).get("PATH"))
+    path = dict(task.worker.env).get("PATH", service_path)
+    where = program if program in PYTHON else shutil.which(program, path=path)
     if where is None:
         return failed(f"{task.name}: there is no program {program} that may be run", fix=fix)
     script = _script(words) if _is_python(program) else None

@@ -640,6 +640,25 @@ def test_a_worker_whose_program_is_missing_is_found(tmp_path: Path, command: str
     assert_finds(run("worker.command", with_command(tmp_path, command)), verdict, word)
 
 
+def test_a_program_is_looked_for_where_the_service_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What lies in the caller's own folder the daemon does not find."""
+    own, root = tmp_path / "bin", tmp_path / "root"
+    own.mkdir()
+    (own / "mymerger").write_text("#!/bin/sh\n")
+    (own / "mymerger").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{own}:{os.environ['PATH']}")
+    scene = replace(with_command(tmp_path, "[mymerger]"), root=root)
+    assert run("worker.command", scene).verdict is PASS, "there is no unit"
+    unit = root / "etc/systemd/system/zsched.service"
+    unit.parent.mkdir(parents=True)
+    unit.write_text("[Service]\nExecStart=/opt/zsched/bin/zsched up\n")
+    assert_finds(run("worker.command", scene), FAIL, "no program mymerger")
+    drop_in = unit.with_name("zsched.service.d") / "path.conf"
+    drop_in.parent.mkdir()
+    drop_in.write_text(f'[Service]\nEnvironment=A=1 "PATH={own}:/usr/bin"\n')
+    assert run("worker.command", scene).verdict is PASS
+
+
 def test_a_worker_s_program_that_is_there_passes(tmp_path: Path) -> None:
     assert run("worker.command", scene_of(tmp_path)).verdict is PASS
     assert run("worker.command", with_command(tmp_path, "[sleep, '1']")).verdict is PASS
