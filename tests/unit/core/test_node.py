@@ -502,6 +502,16 @@ def test_relay_that_is_down_is_a_problem_until_it_is_up() -> None:
     assert node.counters["relay_exits"] == 1
 
 
+def test_a_machine_that_measures_nothing_any_more_is_a_problem_until_it_does() -> None:
+    """A reader that hangs raises nothing, and profiles go on without figures."""
+    node = started()
+    for at, is_told in ((110.0, False), (111.2, True)):
+        node.handle(ev.DeadlineReached(), at)
+        assert any("measuring: nothing of this machine" in one for one in build_snapshot(node, at).problems) is is_told
+    node.handle(ev.ProfileSampled(device=SAMPLE), 112.0)
+    assert not any("measuring" in one for one in build_snapshot(node, 112.0).problems)
+
+
 def test_a_relay_that_keeps_ending_is_a_problem_on_every_node() -> None:
     robot1, robot2 = started("robot1"), started("robot2")
 
@@ -611,6 +621,7 @@ def test_beats_in_our_name_alone_are_a_complaint_that_ends_and_nothing_else() ->
     assert of(batch, do.StandDown) == []
     assert not any(one.state.disputed for one in of(batch, do.PersistState))
     assert node.agreement.is_elector
+    node.handle(ev.ProfileSampled(device=SAMPLE), 111.9 + QUIET_S)
     node.handle(ev.DeadlineReached(), 112.0 + QUIET_S)
     assert node.problems == {}
 

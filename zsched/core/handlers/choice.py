@@ -12,10 +12,14 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.workers import failed_workers, given_away
 from zsched.core.handlers.beats import on_twins
+from zsched.core.profile.profile import BLIND_S
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Proposal
 from zsched.core.values.struct import replace
+
+BLIND = f"nothing of this machine has been measured for {BLIND_S:g} s: a driver or a disk hangs; see the journal"
+"""A reader that raises is told by the sampler; one that hangs is not."""
 
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
 
@@ -41,6 +45,7 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
     node.gateway.absorb(profile, now)
     # A profile that waits for the hearer's next deadline would seem to have been under way for so long.
     todo.add(do.PublishProfile(profile=profile, is_news=node.profiler.has_news or node.has_deadlines))
+    node.set_problem("measuring", BLIND if node.profiler.is_blind(now) else None)
     _look_for_hangs(node, todo, now)
 
 

@@ -47,6 +47,8 @@ JOB_SMOOTHING_S = 1.0
 """Least time constant for jobs: one or two in a sample are no rate."""
 JOB_CHANGE = 0.2
 """This change of the share of done jobs, or this relative change of time per job, sends a profile at once."""
+BLIND_S = 10.0
+"""Without a measurement for so long something hangs: one comes every second or sooner."""
 GAUGE_SMOOTHING_S = 2.0
 """Least time constant of a gauge: a GPU's use jumps between 0 and 1 with every job."""
 RSSI_CHANGE_DB = 1.0
@@ -248,6 +250,10 @@ class Profiler:
     def owe(self, now: float) -> None:
         """Somebody has come who knows nothing of this machine: the next profile is due within one beat."""
         self._sent_at = min(self._sent_at, now + self._timing.beat_s - self._timing.publish_s)
+
+    def is_blind(self, now: float) -> bool:
+        """Whether this machine was measured, and has not been for so long that profiles say nothing of its use."""
+        return self._device is not None and now - self._sampled_at > BLIND_S
 
     def publishable(
         self,
