@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Sequence
 from typing import Final, TextIO
 
 MIN_WIDTH: Final = 60
@@ -21,6 +22,9 @@ COMMAND_LINE: Final = re.compile(r" *(?:sudo )?zsched (?![\w -]*: )")
 """A line of its own; an error's first line begins with the verb, too, and a colon."""
 GLUE: Final = "\0"
 """In place of a blank within a command, which is not broken."""
+CUT_LINES, WRAP_LINES = "\x1b[?7l", "\x1b[?7h"
+"""The terminal cuts lines that are too wide, instead of moving all below them; and wraps them again, as usual."""
+_HOME, _REST_OF_LINE, _REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
 CARET: Final = "^"
 """Begins the line that points into the line above it."""
 
@@ -29,6 +33,15 @@ def fitted(text: str, stream: TextIO, indent: int = 2) -> str:
     """The text as it is written to ``stream``: harmless, and on a terminal no wider than that."""
     shown, width = harmless(text), screen_width(stream)
     return shown if width is None else wrapped(shown, width, indent)
+
+
+def drawn(lines: Sequence[str], end: str = "\n") -> str:
+    """The lines from the top of the screen; what was there is overwritten, so nothing flickers.
+
+    Each is cleared before it is written: behind a whole line the cursor stands on its last character.
+    """
+    *others, last = lines or [""]
+    return _HOME + "".join(f"{_REST_OF_LINE}{line}{end}" for line in others) + _REST_OF_SCREEN + last
 
 
 def screen_width(stream: TextIO | None = None) -> int | None:

@@ -5,9 +5,12 @@ Knows: terminals, intervals, exit codes. Does not know: what a status looks like
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+import signal
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from zsched.clock import wall_ns
@@ -16,12 +19,12 @@ from zsched.commands.common import CliError, Json, print_json, wants_color, warn
 from zsched.commands.report import TROUBLES, degradations, render_status
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK
-from zsched.screen import fitted
+from zsched.screen import CUT_LINES, WRAP_LINES, drawn, fitted
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 MAJOR = "1"
 """Of the status's schema: within it fields are only added."""
-HOME, CLEAR, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[2J", "\x1b[K", "\x1b[J"
+CLEAR = "\x1b[2J"
 
 
 class StatusView(Struct, frozen=True, kw_only=True):
@@ -60,15 +63,26 @@ def watch_on(view: StatusView, interval_s: float) -> int:
     is_screen = sys.stdout.isatty() and not view.is_json
     code = EXIT_OK
     try:
-        sys.stdout.write(CLEAR if is_screen else "")
-        while True:
-            code = status.code if isinstance(status, CliError) else code_of(status)
-            _print_next(view, status, is_screen=is_screen)
-            time.sleep(interval_s)
-            status = _ask_again(door)
+        with _screen() if is_screen else contextlib.nullcontext():
+            while True:
+                code = status.code if isinstance(status, CliError) else code_of(status)
+                _print_next(view, status, is_screen=is_screen)
+                time.sleep(interval_s)
+                status = _ask_again(door)
     except KeyboardInterrupt:
-        sys.stdout.write("\n" if is_screen else "")
         return code
+
+
+@contextlib.contextmanager
+def _screen() -> Iterator[None]:
+    """The terminal for ourselves; SIGTERM is a Ctrl-C meanwhile, else the terminal would go on cutting lines."""
+    old_end = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.stdout.write(CUT_LINES + CLEAR)
+    try:
+        yield
+    finally:
+        sys.stdout.write(f"{WRAP_LINES}\n")
+        signal.signal(signal.SIGTERM, old_end)
 
 
 def _render(view: StatusView, status: Json) -> str:
@@ -118,7 +132,7 @@ def _fitted(text: str) -> str:
         room = height - 1 - len(tail)
         note = f"... {max(last - room, 0)} more lines: a higher window shows them"
         lines = [*lines[: min(room, last)], note, *tail]
-    return HOME + f"{REST_OF_LINE}\n".join(lines) + REST_OF_LINE + REST_OF_SCREEN
+    return drawn(lines)
 
 
 def ask_status(door: Door) -> Json:

@@ -30,11 +30,11 @@ from zsched.commands.watch.top import MIN_HEIGHT, MIN_WIDTH, Frame, render_top
 from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_USAGE
 from zsched.guard import guarded
+from zsched.screen import CUT_LINES, WRAP_LINES, drawn
 
-ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
-"""To the other screen of the terminal, without a cursor; and back to what stood there. A line that is too wide all the
-same (a character may take two columns) is cut by the terminal, instead of moving all lines below it."""
-HOME, REST_OF_LINE, REST_OF_SCREEN = "\x1b[H", "\x1b[K", "\x1b[J"
+ENTER, LEAVE = f"\x1b[?1049h\x1b[?25l{CUT_LINES}", f"{WRAP_LINES}\x1b[?25h\x1b[?1049l"
+"""To the other screen of the terminal, without a cursor; and back to what stood there. Lines may be too wide, for a
+character may take two columns."""
 ENDS: Final = ("q", "Q", "\x03", "\x04")
 STEPS: Final = {"\x1b[A": -1, "\x1b[B": 1, "k": -1, "j": 1, "\x1b[5~": -10, "\x1b[6~": 10}
 """{key: by how many tasks it scrolls}."""
@@ -97,7 +97,7 @@ def _live(view: TopView, feed: Feed, past: Past) -> None:
         asker.start()
         try:
             while True:
-                sys.stdout.write(_drawn(render_top(past, _frame(view, first_task))))
+                sys.stdout.write(drawn(render_top(past, _frame(view, first_task)), "\r\n"))
                 sys.stdout.flush()
                 ready = select.select([sys.stdin.fileno(), reading], [], [])[0]
                 if reading in ready:
@@ -151,12 +151,3 @@ def _frame(view: TopView, first_task: int) -> Frame:
         first_task=first_task,
         period_s=max(view.interval_s, 1.0),
     )
-
-
-def _drawn(lines: list[str]) -> str:
-    """The lines from the top of the screen; what was there is overwritten, so nothing flickers.
-
-    Each is cleared before it is written: behind a whole line the cursor stands on its last character.
-    """
-    *others, last = lines or [""]
-    return HOME + "".join(f"{REST_OF_LINE}{line}\r\n" for line in others) + REST_OF_SCREEN + last

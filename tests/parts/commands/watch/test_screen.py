@@ -23,8 +23,9 @@ import pytest
 
 from support.waiting import DEADLINE_S, until
 from zsched.adapters.host.operator_socket import OperatorSocket
-from zsched.commands.watch.screen import ENTER, LEAVE, _drawn
+from zsched.commands.watch.screen import ENTER, LEAVE
 from zsched.exits import EXIT_UNREACHABLE
+from zsched.screen import drawn as drawn_lines
 
 STATUS: dict[str, Any] = json.loads(
     (Path(__file__).parents[3] / "unit/commands/watch/recorded/fleet.json").read_text(encoding="utf-8")
@@ -112,7 +113,7 @@ def test_a_line_of_wide_characters_is_cut_and_moves_no_other(tmp_path: Path) -> 
     """A character of two columns makes a line twice as wide as its length, and the whole line keeps its last one."""
     lines = ["a" * 40, "\u6f22" * 40, "next", *[""] * 2, "z" * 40]
     drawn = tmp_path / "drawn"
-    drawn.write_text(ENTER + _drawn(["old" * 13] * 6) + _drawn(lines), encoding="utf-8")
+    drawn.write_text(ENTER + drawn_lines(["old" * 13] * 6, "\r\n") + drawn_lines(lines, "\r\n"), encoding="utf-8")
     tmux = ["tmux", "-u", "-S", str(tmp_path / "tmux")]
     cat = f"stty raw; cat {drawn}; sleep 60"
     words = {**os.environ, "LC_ALL": "C.UTF-8"}
