@@ -84,9 +84,12 @@ class Scene:
 
     def put(self, count: int) -> None:
         before = self.count().messages
+        publisher = self.other.declare_publisher("robot1/in", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: matches(publisher), "the relay subscribes, and the application has heard of it")
         for _ in range(count):
-            self.other.put("robot1/in", b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+            publisher.put(b"x")
         until(lambda: self.count().messages == before + count, "the relay has them")
+        undeclare(publisher)
 
     def count(self) -> StreamCount:
         return next(iter(self.task.counts()), StreamCount(stream="t/in/0"))
