@@ -14,6 +14,7 @@ from zenoh import Sample, SampleKind, Timestamp
 
 from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import Route, StreamClass
+from zsched.hop.weight import weight
 from zsched.relay.streams.outlet import QUEUE_DEPTH
 from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import SendQueue
@@ -67,7 +68,7 @@ class Hand:
             timestamp=sample.timestamp or stamp,
             deleted=sample.kind == SampleKind.DELETE,
         )
-        size = len(sample.payload) if size is None else size
+        size = weight(sample) if size is None else size
         return "overflow", self._queue.send(key, partial(self._deliver, received), size)
 
     @property

@@ -26,6 +26,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 import zenoh
 
 from zsched.core.hop.receiver import SourceName
+from zsched.hop.weight import weight
 from zsched.worker.keep import Held
 
 MAX_WITHHELD: Final = 256
@@ -130,12 +131,12 @@ class StandbyInputs(Generic[SourceT]):
         line = self._kept.pop(name, deque())
         self._kept[name] = line
         line.append(done)
-        self._bytes += len(done.sample.payload)
+        self._bytes += weight(done.sample)
         limit = source.newest(is_whole=done.is_whole) or (MAX_BACKLOG if done.quiet_at is None else MAX_WITHHELD)
         given_up = []
         while len(line) > limit or (self._bytes > MAX_BACKLOG_BYTES and len(line) > 1):
             given_up.append(line.popleft())
-            self._bytes -= len(given_up[-1].sample.payload)
+            self._bytes -= weight(given_up[-1].sample)
         if len(self._kept) > MAX_KEYS:
             given_up += self._make_room(name)
         return [one for one in given_up if one.is_lost]
@@ -145,7 +146,7 @@ class StandbyInputs(Generic[SourceT]):
         others = [name for name in self._kept if name != newest]
         others.sort(key=lambda name: any(done.quiet_at is None for done in self._kept[name]))
         gone = [done for name in others[: max(1, MAX_KEYS // ROOM_SHARE)] for done in self._kept.pop(name)]
-        self._bytes -= sum(len(done.sample.payload) for done in gone)
+        self._bytes -= sum(weight(done.sample) for done in gone)
         return gone
 
     def stale(self, epoch: int, now: float) -> set[SourceName]:
@@ -163,7 +164,7 @@ class StandbyInputs(Generic[SourceT]):
                 self._kept[key] = left
             else:
                 del self._kept[key]
-            self._bytes -= sum(len(done.sample.payload) for done in line) - sum(len(one.sample.payload) for one in left)
+            self._bytes -= sum(weight(done.sample) for done in line) - sum(weight(one.sample) for one in left)
         return before - len(self._again) - sum(len(line) for line in self._kept.values())
 
     def begin(self, *, is_settled: bool = False) -> None:

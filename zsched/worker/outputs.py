@@ -16,6 +16,7 @@ from zenoh import CongestionControl, ext
 from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct
+from zsched.hop.weight import weight_of
 from zsched.sessions.puts import Payload, PutArguments, put_arguments
 from zsched.sessions.send_queue import SendQueue
 from zsched.worker.keep import Keeper, KeptLane, put_end
@@ -134,7 +135,8 @@ class Output:
             if self._queue is None:
                 self._put(stamped, given)
                 return True
-            self.shed += self._queue.send(stamped.key, lambda: self._put(stamped, given), len(sent))
+            size = weight_of(sent, attached)
+            self.shed += self._queue.send(stamped.key, lambda: self._put(stamped, given), size)
             return True
 
     def send_end(self, epoch: int) -> None:
@@ -191,7 +193,8 @@ class Output:
         if stamped.lane is None:
             stamped.unkept += 1
         else:
-            number = stamped.lane.keep((payload, attachment, encoding), timestamp, len(payload))
+            size = weight_of(payload, attachment)
+            number = stamped.lane.keep((payload, attachment, encoding), timestamp, size)
             if self.options.reliable:
                 self._owe(stamped.lane, number)
         more: dict[str, Any] = {"attachment": attachment, "encoding": encoding, "timestamp": timestamp}

@@ -19,6 +19,7 @@ class Sample:
 
     key_expr: str = "edge1/t/robot1/in"
     payload: bytes = b"x"
+    attachment: bytes | None = None
 
 
 SOURCE = Input(on_sample=lambda _: None, keep_last=None)

@@ -23,6 +23,7 @@ from zsched.core.hop.serial import serial_of
 from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.core.values.struct import Struct, field
 from zsched.hop.acknowledger import Acknowledger
+from zsched.hop.weight import weight
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams.counter import StreamCounter
 
@@ -64,14 +65,14 @@ class _Early(Struct):
         """Let a sample wait; ``False`` when there is no room."""
         if number not in self.samples:
             self.samples[number] = sample
-            self._weigh(len(sample.payload))
+            self._weigh(weight(sample))
         has_room = len(self.samples) <= MAX_WAITING and self.size <= MAX_WAITING_BYTES
         return has_room and self.total.size <= MAX_EARLY_BYTES
 
     def pop(self, number: int) -> Sample | None:
         """Take one out, if it is there."""
         sample = self.samples.pop(number, None)
-        self._weigh(-len(sample.payload) if sample is not None else 0)
+        self._weigh(-weight(sample) if sample is not None else 0)
         return sample
 
     def _weigh(self, size: int) -> None:

@@ -25,6 +25,7 @@ from zenoh import Sample, Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.core.values.struct import Struct
+from zsched.hop.weight import weight
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
@@ -428,7 +429,7 @@ class InputStream:
                 self._replay(self._active, _never)
             paused, self._paused, self._paused_bytes = self._paused, deque(), 0
             for sample, stamp in paused:
-                self._route_on(sample, stamp, len(sample.payload))
+                self._route_on(sample, stamp, weight(sample))
 
     # --- a crash, with `OnCrash.REPLAY` (under the lock) --------------------------------------------------------------
 
@@ -457,7 +458,7 @@ class InputStream:
 
     def _owe(self, owed: list[LeftOpen]) -> None:
         for one in owed:
-            size = len(one.sample.payload)
+            size = weight(one.sample)
             if len(self._owed) < MAX_OWED and self._owed_bytes + size <= MAX_BYTES:
                 self._owed.append(one)
                 self._owed_bytes += size
@@ -477,7 +478,7 @@ class InputStream:
         self._active, self._next, self._waits_for = None, slot, left
         self._hold_until = monotonic_s() + HOLD_S
         self._held = left.outlet.take_back()
-        self._held_bytes = sum(len(sample.payload) for sample, _ in self._held)
+        self._held_bytes = sum(weight(sample) for sample, _ in self._held)
 
     def _end_hold_behind(self, slot: _InputSlot, has_answer: Callable[[Timestamp], bool]) -> None:
         """End the wait if it is for this slot's end, and not for a later one's."""
@@ -537,14 +538,14 @@ class InputStream:
     # --- one sample --------------------------------------------------------------------------------------------------
 
     def _carry(self, sample: Sample, *, is_given: bool = False) -> None:
-        active, size = self._active, len(sample.payload)
+        active, size = self._active, weight(sample)
         if active is not None and self._is_patient and not self._is_paused:
             active.outlet.wait_for_room(size)
         with self._lock:
             if is_given and self._has_end:
                 self._is_late = True
                 return
-            self._counter.seen(size)
+            self._counter.seen(len(sample.payload))
             if self._loop_ids and _is_own(sample, self._loop_ids):
                 self._counter.dropped("loop")
                 return

@@ -34,6 +34,7 @@ from zsched.core.relay_protocol import EndMarker, StreamAck, mark_of
 from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
 from zsched.guard import tolerant
+from zsched.hop.weight import weight
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.crowd import Crowd
 from zsched.relay.streams.greetings import Greetings
@@ -211,7 +212,7 @@ class Outlet:
             if self._acks is None:
                 self._leave_unconfirmed(lane)
             return _ALL_WENT
-        size = len(sample.payload) if size is None else size
+        size = weight(sample) if size is None else size
         action = lambda: self._put(lane, sample, stamp, size)  # noqa: E731 - named for the line's length
         dropped = self._queue.send(lane, action, size, (sample, stamp))
         self._handed += 1 - dropped
@@ -230,7 +231,7 @@ class Outlet:
         lane = self._lane(sample)
         if lane is None:
             return False
-        stamp, size = sample.timestamp or stamp, len(sample.payload)
+        stamp, size = sample.timestamp or stamp, weight(sample)
         if not self._queue.claim(lambda: self._put(lane, sample, stamp, size), (sample, stamp)):
             return False
         self._handed += 1
@@ -564,7 +565,7 @@ class Outlet:
         """Put again what somebody has missed: here, where nothing that is newer waits before it."""
         self._makes_up = False
         for lane, sample, stamp in crowd.take_owed():
-            self._put(lane, sample, stamp, len(sample.payload))
+            self._put(lane, sample, stamp, weight(sample))
 
     def _note_put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int, began: float) -> None:
         with self._lock:

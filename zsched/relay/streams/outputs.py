@@ -24,6 +24,7 @@ from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCoun
 from zsched.core.values.struct import replace
 from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger
+from zsched.hop.weight import weight
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
@@ -456,8 +457,8 @@ class OutputStream:
     ) -> None:
         """``number``: the sample's on the hop where that is known, `UNNUMBERED` for a foreign worker's."""
         number = _publisher_of(sample)[1] if number is None else number
-        size = len(sample.payload)
-        self._counter.seen(size)
+        size = weight(sample)
+        self._counter.seen(len(sample.payload))
         key.received += 1
         key.heard_at = monotonic_s()
         if number != UNNUMBERED and publisher not in key.sources:
@@ -488,9 +489,9 @@ class OutputStream:
 
     def _hold(self, slot: OutputSlot, sample: Sample) -> None:
         slot.held.append(sample)
-        slot.held_bytes += len(sample.payload)
+        slot.held_bytes += weight(sample)
         while len(slot.held) > HOLD_SAMPLES or (slot.held_bytes > HOLD_BYTES and len(slot.held) > 1):
-            slot.held_bytes -= len(slot.held.popleft().payload)
+            slot.held_bytes -= weight(slot.held.popleft())
             self._counter.dropped("overflow")
 
     def _promote(self) -> None:
@@ -513,7 +514,7 @@ class OutputStream:
     def _release(self, slot: OutputSlot) -> None:
         while slot.held and not self._is_paused:
             sample = slot.held.popleft()
-            slot.held_bytes -= len(sample.payload)
+            slot.held_bytes -= weight(sample)
             self._forward(sample)
 
     def _forward(self, sample: Sample, size: int | None = None) -> None:

@@ -64,7 +64,7 @@ class Bench:
         """A sample comes; how many pass."""
         key = self.slot.key(f"edge1/t/1/{name}")
         assert key is not None
-        sample = cast("Sample", SimpleNamespace(payload=bytes(size)))
+        sample = cast("Sample", SimpleNamespace(payload=bytes(size), attachment=None))
         ready = self.answers.take((key.name, zid, 1), number, sample)
         for at, _ in enumerate(ready):
             key.heard_at = self.now
