@@ -338,10 +338,13 @@ class Stages:
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)
-        drained = frozenset(self.flags.drained)
-        if not in_grace and not unproven and not unfit and not unseen and not drained:
+        left = frozenset(self.flags.drained)
+        owner = self.values()[spec.name].owner
+        if owner is not None and self.rounds.tasks[spec.name].judge.is_overdue(now):
+            left |= {owner}
+        if not in_grace and not unproven and not unfit and not unseen and not left:
             return NO_DOUBTS
-        return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, drained=drained, unfit=unfit)
+        return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, left=left, unfit=unfit)
 
     def counts_age_s(self, now: float) -> float:
         """For how long the relay has told no counts; 0 before the first."""

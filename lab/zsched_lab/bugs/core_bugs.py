@@ -1294,7 +1294,7 @@ VOTE_BUGS = (
     _bug(
         "a drained owner keeps a task that would come back over a weak link",
         SCORING,
-        "is_kept = has_owner and owner not in doubts.drained and may_return(spec, told)",
+        "is_kept = has_owner and owner not in doubts.left and may_return(spec, told)",
         "is_kept = has_owner",
         ("tests/unit/core/scheduler/test_scoring.py",),
     ),

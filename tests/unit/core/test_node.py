@@ -1239,9 +1239,18 @@ def test_profiles_are_echoed_where_an_operator_has_set_a_deadline(*, is_known: b
 
 def test_a_drained_node_is_known_to_keep_nothing() -> None:
     node = started()
-    assert node._doubts(FLEET.tasks[0], 100.0).drained == frozenset()
-    node.flags.drained = {"edge1": "drained by ada"}
-    assert node._doubts(FLEET.tasks[0], 100.0).drained == {"edge1"}
+    assert node._doubts(FLEET.tasks[0], 100.0).left == frozenset()
+    node.flags.drained = {"edge2": "drained by ada"}
+    assert node._doubts(FLEET.tasks[0], 100.0).left == {"edge2"}
+
+
+def test_so_is_an_owner_whose_worker_is_not_ready_in_time() -> None:
+    node = started(learnt=allocation_of(1, "edge1"))
+    (spec,) = FLEET.tasks
+    node.rounds.tasks[spec.name].judge.not_ready_since = 100.0
+    start_s = spec.worker.start_deadline_s
+    assert node._doubts(spec, 100.0 + start_s).left == frozenset()
+    assert node._doubts(spec, 100.1 + start_s).left == {"edge1"}
 
 
 def test_links_that_begin_and_cease_to_hold_beats_up_are_in_the_story() -> None:

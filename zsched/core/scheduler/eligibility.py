@@ -40,14 +40,12 @@ def has_living_owner(spec: TaskSpec, owner_state: PeerState, profile: Profile | 
 def may_return(spec: TaskSpec, profile: Profile | None) -> bool:
     """Whether a task that left its owner might soon come back, for all that the owner tells: then margins count.
 
-    Not to one that stops or gives it away, or whose worker is not ready. ``profile``: its newest fresh one.
+    Not to one that stops or gives it away. ``profile``: its newest fresh one.
     """
     if profile is None:
         return True
     load = profile.worker(spec.name)
-    if load is None:
-        return not profile.draining and not spec.worker.command
-    return not profile.draining and load.state is WorkerState.READY and load.renewal is not Renewal.LEAVES
+    return not profile.draining and (load is None or load.renewal is not Renewal.LEAVES)
 
 
 def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:

@@ -94,6 +94,11 @@ class Judge:
             self.not_ready_since = now
         return now - self.not_ready_since
 
+    def is_overdue(self, now: float) -> bool:
+        """Whether the owner's worker was heard not to be ready for longer than a start may take."""
+        since = self.not_ready_since
+        return since is not None and now - since > self.spec.worker.start_deadline_s
+
     def memory(self) -> JudgeMemory:
         """What this judge remembers, as a value."""
         players, watched_at = self.learnt.memory() if self.spec.learns_patience else ((), None)

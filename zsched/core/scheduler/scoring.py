@@ -76,8 +76,9 @@ class Doubts(Struct, frozen=True, kw_only=True):
     """{candidate: why it may not get the task} of those that were gone (`zsched.core.scheduler.probation`)."""
     unseen: AbstractSet[NodeId] = frozenset()
     """Not reached by this robot's streams, though by its questions (`zsched.core.scheduler.unseen`)."""
-    drained: AbstractSet[NodeId] = frozenset()
-    """They hand over what they have, by an operator's order: an owner among them does not get its task back."""
+    left: AbstractSet[NodeId] = frozenset()
+    """They are to hand over the task (an operator's order, a worker that is not ready in time): an owner among them
+    does not get it back."""
     unfit: Mapping[NodeId, str] = field(default_factory=dict)
     """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
 
@@ -121,7 +122,7 @@ def score(
     has_owner = owner is not None and has_living_owner(
         spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace
     )
-    is_kept = has_owner and owner not in doubts.drained and may_return(spec, told)
+    is_kept = has_owner and owner not in doubts.left and may_return(spec, told)
     of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
     margin_db = own_margin_db = 0.0
     if is_kept and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:

@@ -49,7 +49,8 @@ def coming_use(
 
     Memory that a worker holds and no process shows (a GPU's, where that is the machine's) is in use and would count
     twice. How much of what a task asks for is held like that nobody measures: at most what the machine has in use
-    beyond the workers' processes. That much is not reserved against a task that has no other place.
+    beyond the workers' processes. That much is not reserved against a task that has no other place, once the other's
+    worker has had the time to take it; nor against a task that is there, which that would drive away.
 
     Args:
         spec: the task that is to be there.
@@ -62,18 +63,19 @@ def coming_use(
     others = () if bookings is None else bookings.get(profile.node, ())
     if not others:
         return _NOTHING
+    is_home = any(other.name == spec.name for other in others)
     cpu = memory = hidden_mb = 0.0
     for other in others:
         load = profile.worker(other.name)
         if other.name != spec.name and load is not None:
-            # what it had come to use ended with it; what the file asks for stays reserved
+            # what it had come to use ended with it; what the file asks for stays reserved, but see below
             demand = other.demand if load.state is WorkerState.FAILED else gateway.demand(other, profile)
             unshown = 1.0 if other.worker.command else gateway.demands.unshown_ratio(other.name, profile.node, now)
             if not (is_full(profile) and is_short(load)):
                 cpu += unshown * max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
             unshown_mb = unshown * max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
             is_working = other.worker.command and load.state is WorkerState.READY
-            if own is not None and is_working and gateway.demands.holds_all(other.name, profile.node, now):
+            if own is not None and is_working and (is_home or gateway.demands.holds_all(other.name, profile.node, now)):
                 hidden_mb += unshown_mb
             else:
                 memory += unshown_mb

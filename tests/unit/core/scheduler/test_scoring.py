@@ -268,17 +268,17 @@ def test_who_reaches_the_owner_reaches_another_candidate_from_a_margin_on(
 
 
 @pytest.mark.parametrize(
-    ("owner", "drained", "is_reached"),
+    ("owner", "left", "is_reached"),
     [
         ({}, (), False),
         ({}, ("edge1",), True),
         ({"draining": True}, (), True),
-        ({"state": WorkerState.STARTING}, (), True),
-        ({"state": None}, (), True),
+        ({"state": WorkerState.STARTING}, (), False),  # a cold standby that begins: what was fled must not be better
+        ({"state": WorkerState.STARTING}, ("edge1",), True),  # it has had its time
     ],
 )
 def test_an_owner_that_the_task_cannot_return_to_asks_for_no_margin(
-    owner: dict[str, Any], drained: tuple[str, ...], *, is_reached: bool
+    owner: dict[str, Any], left: tuple[str, ...], *, is_reached: bool
 ) -> None:
     """A weak link is better than none, and a machine that is nearly out of its limits better than a drained one."""
     spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
@@ -288,7 +288,7 @@ def test_an_owner_that_the_task_cannot_return_to_asks_for_no_margin(
         profile("edge2", links=radio(-79.0)),
         replace(profile("edge3"), gauges=(("battery", 0.23),)),
     )
-    vector = scored(ROBOT, *edges, spec=spec, agreed=agreed, doubts=Doubts(drained=frozenset(drained)))
+    vector = scored(ROBOT, *edges, spec=spec, agreed=agreed, doubts=Doubts(left=frozenset(left)))
     (weak,) = (one for one in vector.utilities if one.candidate == "edge2")
     assert weak.reachable is is_reached
     assert ("edge3" not in dict(vector.refused)) is is_reached

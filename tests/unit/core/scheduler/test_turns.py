@@ -174,6 +174,21 @@ def test_memory_that_another_worker_holds_and_no_process_shows_leaves_no_task_wi
     assert dict(vector.refused) == refused
 
 
+@pytest.mark.parametrize("mine", ["a", "b"])
+def test_two_tasks_that_fit_a_machine_keep_it_though_a_robot_has_just_begun_to_look(mine: str) -> None:
+    """Both hold memory that no process shows: 1500 by others, 3000 and 1850 by theirs, of 6500."""
+    specs = {"a": replace(A, demand=Demand(memory_mb=3000.0)), "b": replace(B, demand=Demand(memory_mb=1850.0))}
+    gateway = Gateway(fleet_of(*specs.values(), of=("edge1", "edge2"), electors=("robot1",)))
+    workers = (load_of("a", cpu_cores=0.1, memory_mb=500.0), load_of("b", cpu_cores=0.1, memory_mb=50.0))
+    gateway.absorb(profile_of(memory_mb=6500.0, memory_used_mb=6350.0, workers=workers), 0.0)
+    for name in specs:
+        gateway.learn_demand(name, "edge1", 0.0)
+    tuning = tuning_of(score=ScoreForm.SERVICE)
+    agreed = {name: allocation_of(owner="edge1", task=name, tuning=tuning) for name in specs}
+    vector = score(specs[mine], agreed[mine], "robot1", gateway, ALIVE, 0.0, book(specs.values(), agreed))
+    assert dict(vector.refused) == {"edge2": "no fresh profile"}
+
+
 STARVED = Demand(cpu_cores=2.0, memory_mb=100.0)
 TUNING = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE)
 STARVED_A, STARVED_B = (
