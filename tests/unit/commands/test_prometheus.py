@@ -147,7 +147,9 @@ def test_a_count_that_is_there_for_the_first_time_is_seen(alert: str) -> None:
     risen, appeared = rule["expr"].split(" or ")
     assert re.search(r"(?:rate|increase)\((.+?)\[(\d+)m\]\)", risen)
     counted, window = re.findall(r"(?:rate|increase)\((.+?)\[(\d+)m\]\)", risen)[0]
-    assert f"({counted} unless {counted.partition('{')[0]} offset {window}m) > " in appeared
+    name = counted.partition("{")[0]
+    heard = f"and on (instance) (zsched_up offset {window}m == 1)"
+    assert f"(({counted} unless {name} offset {window}m) {heard}) > " in appeared, "a node that is back is not new"
 
 
 def test_a_node_that_was_never_heard_is_told_as_one_that_is_gone() -> None:
