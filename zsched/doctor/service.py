@@ -160,13 +160,20 @@ def user_of_service(scene: Scene) -> tuple[int, int] | None:
 
 
 def path_of_service(scene: Scene) -> str | None:
-    """Where the daemon looks for programs, as ``PATH`` says it; ``None``: there is no unit."""
+    """Where the daemon looks for programs, as ``PATH`` says it; ``None``: there is no unit, or it is not plain there.
+
+    A file of variables may say another one, and systemd's specifiers (``%h``) are not read here.
+    """
     unit = _unit(scene)
     if unit is None:
         return None
-    told = (shlex.split(value) for name, value in _settings(scene, unit) if name == "Environment")
-    paths = [word.removeprefix("PATH=") for words in told for word in words if word.startswith("PATH=")]
-    return paths[-1] if paths else SYSTEMD_PATH
+    settings, path = _settings(scene, unit), SYSTEMD_PATH
+    for value in (value for name, value in settings if name == "Environment"):
+        if not value:  # all that was said before counts no more
+            path = SYSTEMD_PATH
+        with contextlib.suppress(ValueError):  # systemd passes over such a line, too
+            path = next((word[5:] for word in reversed(shlex.split(value)) if word.startswith("PATH=")), path)
+    return None if "%" in path or _last(settings, "EnvironmentFile") else path
 
 
 def _key(scene: Scene, settings: Settings, reader: _Reader) -> Iterator[Result]:

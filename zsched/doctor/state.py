@@ -5,6 +5,7 @@ Knows: the state file, fsync, free space. Does not know: what else needs the dis
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import statistics
@@ -110,16 +111,21 @@ def _sync_s(folder: Path) -> float:
 
 def has_space(scene: Scene) -> Result:
     """Whether the state folder's disk has room and may be written."""
-    folder = next(
-        (one for one in (scene.state_folder, *scene.state_folder.parents) if os.access(one, os.X_OK)), Path("/")
-    )
-    facts = os.statvfs(folder)
+    folder, facts = _disk_of(scene.state_folder)
     return judged_space(
         folder,
         free=facts.f_bavail * facts.f_frsize,
         files=facts.f_favail if facts.f_files else None,
         is_read_only=bool(facts.f_flag & os.ST_RDONLY),
     )
+
+
+def _disk_of(folder: Path) -> tuple[Path, os.statvfs_result]:
+    """(the folder or the nearest one above it that is there for us, what is known of its disk)."""
+    for one in (folder, *folder.parents):
+        with contextlib.suppress(OSError):
+            return one, os.statvfs(one)
+    return Path("/"), os.statvfs("/")
 
 
 def judged_space(folder: Path, *, free: int, files: int | None, is_read_only: bool) -> Result:

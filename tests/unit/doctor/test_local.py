@@ -655,8 +655,13 @@ def test_a_program_is_looked_for_where_the_service_looks(tmp_path: Path, monkeyp
     assert_finds(run("worker.command", scene), FAIL, "no program mymerger")
     drop_in = unit.with_name("zsched.service.d") / "path.conf"
     drop_in.parent.mkdir()
-    drop_in.write_text(f'[Service]\nEnvironment=A=1 "PATH={own}:/usr/bin"\n')
+    drop_in.write_text(f'[Service]\nEnvironment=A=1 "PATH={own}:/usr/bin"\nEnvironment=NOTE=it\'s\n')
     assert run("worker.command", scene).verdict is PASS
+    drop_in.write_text(f"[Service]\nEnvironment=PATH={own}\nEnvironment=\n")
+    assert run("worker.command", scene).verdict is FAIL, "an empty line takes back what stood before"
+    for elsewhere in ("EnvironmentFile=-/etc/default/zsched", "Environment=PATH=%h/bin"):
+        drop_in.write_text(f"[Service]\n{elsewhere}\n")
+        assert run("worker.command", scene).verdict is PASS, "nobody can tell from here"
 
 
 def test_a_worker_s_program_that_is_there_passes(tmp_path: Path) -> None:
