@@ -3,8 +3,8 @@
 Knows: Jetson's ``load`` (per mille), five functions of ``libnvidia-ml.so.1``, amdgpu's ``gpu_busy_percent``. Of several
 GPUs of one maker the freest counts. Does not know: which process uses how much.
 
-On a Jetson NVML finds a GPU and answers "not supported", so its file goes first. amdgpu goes last: a processor's own
-GPU idles beside the card that does the work, and would be the freest one. NVML is called by ctypes: five calls need no
+On a Jetson NVML finds a GPU and answers "not supported", so its file goes first. amdgpu counts where NVML knows no
+card: a processor's own GPU idles beside the card that does the work. NVML is called by ctypes: five calls need no
 bindings. The library is loaded only where the driver is. What it has opened tells nothing any more once the driver was
 reset or loaded anew, so it is opened again then.
 """
@@ -42,10 +42,12 @@ class Reader:
         if not loads and (self._root / DRIVER).exists():
             self._nvml = self._nvml or _Nvml(self._library)
             loads = self._nvml.loads()
+            has_cards = self._nvml.count > 0 or self._nvml.is_lost
             if self._nvml.is_lost:
                 self._nvml.close()
                 self._nvml = None
-                return None
+            if has_cards:
+                return min(loads, default=None)
         if not loads:
             loads = [busy / 100.0 for file in self._found(AMD) if (busy := number(file)) is not None]
         return min(loads, default=None)
@@ -69,6 +71,8 @@ class _Nvml:
         self._c: Any = ctypes
         self._rates: Any = Rates
         self._lib: Any = ctypes.CDLL(library)
+        self.count = 0
+        """How many GPUs it has told of."""
         self.is_lost = False
         """No GPU has told anything at the last question, and not for want of support: it may be open in vain."""
         code = self._lib.nvmlInit_v2()
@@ -85,6 +89,7 @@ class _Nvml:
         if self._lib.nvmlDeviceGetCount_v2(self._c.byref(count)):
             self.is_lost = True
             return []
+        self.count = count.value
         told = [self._load(index) for index in range(count.value)]
         found = [busy for code, busy in told if code == 0]
         self.is_lost = not found and any(code != NOT_SUPPORTED for code, _ in told)

@@ -144,6 +144,7 @@ def test_the_processors_own_gpu_does_not_hide_the_card_beside_it(tmp_path: Path)
     assert reader.read() == pytest.approx(0.35)
     ctypes.CDLL(name).reset()
     assert reader.read() is None, "the card tells nothing for a moment: that does not make the machine idle"
+    assert gpu.Reader(tmp_path, library(tmp_path, rates=3)).read() is None, "nor does a card that never tells its use"
 
 
 def test_nvml_that_is_not_there_does_not_start_or_tells_nothing_is_no_reading(tmp_path: Path) -> None:
