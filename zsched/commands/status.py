@@ -5,12 +5,9 @@ Knows: terminals, intervals, exit codes. Does not know: what a status looks like
 
 from __future__ import annotations
 
-import contextlib
 import shutil
-import signal
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from zsched.clock import wall_ns
@@ -63,26 +60,15 @@ def watch_on(view: StatusView, interval_s: float) -> int:
     is_screen = sys.stdout.isatty() and not view.is_json
     code = EXIT_OK
     try:
-        with _screen() if is_screen else contextlib.nullcontext():
-            while True:
-                code = status.code if isinstance(status, CliError) else code_of(status)
-                _print_next(view, status, is_screen=is_screen)
-                time.sleep(interval_s)
-                status = _ask_again(door)
+        sys.stdout.write(CLEAR if is_screen else "")
+        while True:
+            code = status.code if isinstance(status, CliError) else code_of(status)
+            _print_next(view, status, is_screen=is_screen)
+            time.sleep(interval_s)
+            status = _ask_again(door)
     except KeyboardInterrupt:
+        sys.stdout.write("\n" if is_screen else "")
         return code
-
-
-@contextlib.contextmanager
-def _screen() -> Iterator[None]:
-    """The terminal for ourselves; SIGTERM is a Ctrl-C meanwhile, else the terminal would go on cutting lines."""
-    old_end = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    sys.stdout.write(CUT_LINES + CLEAR)
-    try:
-        yield
-    finally:
-        sys.stdout.write(f"{WRAP_LINES}\n")
-        signal.signal(signal.SIGTERM, old_end)
 
 
 def _render(view: StatusView, status: Json) -> str:
@@ -112,7 +98,8 @@ def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -
         return
     else:
         text = _render(view, status)
-    sys.stdout.write(_fitted(text) if is_screen else f"{text}\n")
+    # who stops us between two pictures has the terminal as it was
+    sys.stdout.write(f"{CUT_LINES}{_fitted(text)}{WRAP_LINES}" if is_screen else f"{text}\n")
     sys.stdout.flush()
 
 
