@@ -236,7 +236,7 @@ def show_rates(view: StreamView, word: str | None, verb: str) -> int:
             turns += 1
             found = _window(tap, view.window_s, carry)
             code = EXIT_OK if found else EXIT_FAILED
-            _print_rates(view, verb, found, tap.missed)
+            _print_rates(view, verb, found, tap.missed, tap.told("counted"))
             # a gap across windows counts in the last one; other keys may have come in those between
             carry |= {name: KeyStats(last_at=stats.last_at) for name, stats in found.items()}
     return code
@@ -252,7 +252,9 @@ def _window(tap: StreamTap, window_s: float, carry: dict[tuple[str, str], KeySta
     return stats
 
 
-def _print_rates(view: StreamView, verb: str, found: dict[tuple[str, str], KeyStats], missed: int) -> None:
+def _print_rates(
+    view: StreamView, verb: str, found: dict[tuple[str, str], KeyStats], missed: int, told: str = ""
+) -> None:
     rows = {name: stats.as_json(view.window_s) for name, stats in sorted(found.items())}
     if view.is_json:
         keys = [{"key": key, "side": side, **row} for (side, key), row in rows.items()]
@@ -264,8 +266,8 @@ def _print_rates(view: StreamView, verb: str, found: dict[tuple[str, str], KeySt
     for (side, key), row in rows.items():
         where = f"{key} ({side} side)" if side != "fleet" else key
         say(f"{where}: {_hz_text(row) if verb == 'hz' else _bw_text(row)}")
-    if missed:
-        say(f"... at least {missed} more samples came faster than they could be counted")
+    if told:
+        say(f"... {told}")
 
 
 def _hz_text(row: Json) -> str:
@@ -291,8 +293,8 @@ def show_tail(view: StreamView, word: str | None) -> int:
                 if view.count is not None and seen >= view.count:
                     break
         finally:
-            if tap.missed:
-                warn(f"zsched stream: at least {tap.missed} samples came faster than they could be printed")
+            if told := tap.told("printed"):
+                warn(f"zsched stream: {told}")
     return EXIT_OK if seen else EXIT_FAILED
 
 

@@ -2,8 +2,9 @@
 
 Knows: zenoh sessions and subscribers, arrival times. Does not know: nodes, streams, what is made of the samples.
 
-Who only looks must not hold up what he looks at: what comes faster than it is taken is dropped here, and counted. What
-waits for a reader that stands still (a terminal that is held, a pager) is bounded in number and in bytes.
+Who only looks must not hold up what he looks at. What waits for a reader that stands still (a terminal that is held, a
+pager) is bounded in number and in bytes; what is dropped by that is counted. What comes faster than our thread takes it
+zenoh drops without a count: then it is told that more may be missing.
 """
 
 from __future__ import annotations
@@ -63,7 +64,9 @@ class StreamTap:
             AdapterError: a session cannot be opened, or a key is none.
         """
         self.missed = 0
-        """Samples that came faster than they could be taken, at least."""
+        """Samples that came faster than the reader took them."""
+        self.may_miss_more = False
+        """They came faster than our thread took them, too: what zenoh has dropped nobody counts."""
         self._kept_bytes = kept_bytes
         self._samples: deque[Tapped] = deque()
         self._held_bytes = 0
@@ -115,8 +118,15 @@ class StreamTap:
             self._came.notify()
 
     def _note_overflow(self) -> None:
-        with self._came:
-            self.missed += 1
+        self.may_miss_more = True
+
+    def told(self, done: str) -> str:
+        """What was missed, in words; empty: nothing. ``done``: what is made of samples."""
+        some = str(self.missed) if self.missed else "some"
+        more = ", and maybe more" if self.missed and self.may_miss_more else ""
+        maybe = "maybe " if self.may_miss_more and not self.missed else ""
+        told = f"{maybe}{some} samples{more} came faster than they could be {done}"
+        return told if self.missed or self.may_miss_more else ""
 
     def until(self, end: float) -> Iterator[Tapped]:
         """What comes until ``end`` (`monotonic_s`), in order of arrival."""

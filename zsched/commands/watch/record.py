@@ -91,10 +91,8 @@ def record(view: RecordView) -> int:
             news = feed.ask()
             away.tell(news.why or news.log_why)
     told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
-    missed = ""
-    if tap is not None and tap.missed:
-        missed = f"; at least {tap.missed} samples came faster than they could be written"
-    warn(f"{told}{missed}")
+    missed = "" if tap is None else tap.told("written")
+    warn(f"{told}; {missed}" if missed else told)
     return EXIT_OK
 
 

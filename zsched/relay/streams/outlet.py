@@ -197,7 +197,7 @@ class Outlet:
     def send(self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None) -> tuple[str, int]:
         """Put one sample; answers (why something was dropped, how much of it), with 0 when nothing was.
 
-        ``stamp`` stands in for the timestamp that the sample lacks; ``size`` is its payload's, where it is known.
+        ``stamp`` stands in for the timestamp that the sample lacks; ``size`` is its `weight`, where it is known.
         """
         lane = self._lane(sample)
         if lane is None:
