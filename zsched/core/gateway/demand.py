@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container
-from typing import Final
+from typing import Final, Self
 
 from zsched.core.gateway.company import is_full
 from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, other_s, told_job
@@ -41,11 +41,35 @@ SAME_JOB_RATIO = 0.8
 """CPU times per answer count as the same up to this quotient: both are means of some answers."""
 
 
+class _Most(Struct, frozen=True):
+    """The most of some figures within the last `RECENT_S`, to half of that."""
+
+    now: float
+    """Of this half..."""
+    since: float
+    """...which began then."""
+    before: float = 0.0
+    """Of the half before."""
+
+    @property
+    def value(self) -> float:
+        """The most of both."""
+        return max(self.now, self.before)
+
+    def with_one(self, value: float, at: float) -> Self:
+        """With one more figure."""
+        age_s = at - self.since
+        if age_s < RECENT_S / 2:
+            return replace(self, now=max(self.now, value))
+        return replace(self, now=value, since=at, before=self.now if age_s < RECENT_S else 0.0)
+
+
 class _Before(Struct, frozen=True):
     """What another machine had shown of a task when it came, if any had; ``None``: nothing sure."""
 
     work: float | None = None
     job_work_s: float | None = None
+    """CPU time of its largest jobs there: a machine is not slower for a job that is."""
 
 
 class _Known(Struct, frozen=True):
@@ -54,10 +78,12 @@ class _Known(Struct, frozen=True):
     work: float | None = None
     is_sure: bool = False
     """It was measured with enough CPU; otherwise the need may be larger."""
-    job_work_s: float | None = None
+    job_work_s: _Most | None = None
     """CPU time of a job at speed 1, of all its threads; ``None``: its worker is silent."""
     before: _Before | None = None
     """``None``: it has not come from elsewhere."""
+    job_least_s: float | None = None
+    """The least CPU time of a job here, as long as that is compared with what it took before."""
     seen_at: NodeId | None = None
     """Where these figures were seen last..."""
     seen_s: float = 0.0
@@ -131,8 +157,10 @@ class Demands:
         is_new, is_calm = now - found.since < SETTLE_S, now - found.full_at > CALM_S
         before = found.before if now - found.since < COMPARED_S else None
         job_cpu_s = self._job_cpu_s(task, load, None if is_new else heard, now)
-        if before is not None:
-            self._compare_jobs(task, profile, job_cpu_s, before, is_told=load.jobs is not None)
+        if before is not None and job_cpu_s:
+            least_s = min(job_cpu_s, found.job_least_s or job_cpu_s)
+            found = replace(found, job_least_s=least_s)
+            self._compare_jobs(task, profile, least_s, before, is_told=load.jobs is not None)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
@@ -208,18 +236,17 @@ class Demands:
         spending.absorb(load.spent_s, heard.counts, now)
         return spending.per_answer_s
 
-    def _compare_jobs(
-        self, task: TaskId, profile: Profile, cpu_s: float | None, before: _Before, *, is_told: bool
-    ) -> None:
+    def _compare_jobs(self, task: TaskId, profile: Profile, least_s: float, before: _Before, *, is_told: bool) -> None:
         """What a job takes here and took where the task came from tells its speed, also of one that is short.
 
-        It is never faster than the benchmark says. A job that takes less here may do so because others slowed it down
-        where it came from, or because its worker begins with nothing. Then all other machines would seem too slow for
-        as long as the task stays, and nothing but a move would tell.
+        A task's jobs differ, and may grow while it moves: it is slower here only if the least that they take exceeds
+        the most that they took there in the last minute. It is never faster than the benchmark says. A job that takes
+        less here may do so because others slowed it down where it came from, or because its worker begins with nothing.
+        Then all other machines would seem too slow for as long as the task stays, and nothing but a move would tell.
         """
-        if not cpu_s or not before.job_work_s:
+        if not before.job_work_s:
             return
-        speed, benchmark = before.job_work_s / cpu_s, speed_of(profile)
+        speed, benchmark = before.job_work_s / least_s, speed_of(profile)
         if not is_told and speed >= SAME_JOB_RATIO * benchmark:
             speed = benchmark
         self._speeds.note(task, profile, min(speed, benchmark))
@@ -285,8 +312,10 @@ def _came(known: _Known, node: NodeId, now: float) -> _Known:
     """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
     before = _Before() if known.is_unplaced else None
     if known.seen_at not in (None, node) and now - known.seen_s <= RECENT_S:
-        before = _Before(known.work if known.is_sure else None, known.job_work_s)
-    return replace(known, owner=node, since=now, before=before, seen_at=node, full_at=-math.inf, is_unplaced=False)
+        most = known.job_work_s
+        before = _Before(known.work if known.is_sure else None, None if most is None else most.value)
+    found = replace(known, owner=node, since=now, before=before, job_least_s=None, seen_at=node)
+    return replace(found, full_at=-math.inf, is_unplaced=False)
 
 
 def _gets_all(load: WorkerLoad, cores: float) -> bool:
@@ -362,7 +391,14 @@ def _with_heard(
     if cpu_s is None or hz is None:
         return replace(known, is_job_old=known.is_job_old or is_old)
     job = heard.job(cpu_s, hz, speed, known.job, is_calm=is_calm)
-    return replace(known, job=job, job_work_s=cpu_s * speed, is_job_old=is_old)
+    return replace(known, job=job, job_work_s=_with_jobs_work(known, cpu_s * speed), is_job_old=is_old)
+
+
+def _with_jobs_work(known: _Known, work_s: float) -> _Most:
+    """With what a job takes now."""
+    if known.job_work_s is None:
+        return _Most(work_s, known.seen_s)
+    return known.job_work_s.with_one(work_s, known.seen_s)
 
 
 def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is_calm: bool) -> _Known:
@@ -374,7 +410,8 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is
     if load.jobs is not None:
         job = told_job(load.jobs, speed, known.job, is_calm=is_calm, used_cores=load.cpu_cores)
         # a worker that has just come may begin with nothing, and its first jobs be small by that
-        job_work_s = known.job_work_s if is_new and known.before is not None else load.jobs.cpu_s * speed
+        is_first = is_new and known.before is not None
+        job_work_s = known.job_work_s if is_first else _with_jobs_work(known, load.jobs.cpu_s * speed)
         return replace(known, job=job, job_work_s=job_work_s, is_job_old=is_old)
     silent = known if is_new else replace(known, job_work_s=None)
     if is_old:

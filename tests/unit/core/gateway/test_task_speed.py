@@ -288,6 +288,56 @@ def test_a_machine_that_the_task_leaves_at_once_has_shown_how_slow_it_is() -> No
     assert (demands.speed("merge", home), demands.speed("merge", there)) == pytest.approx((1.0, 0.25))
 
 
+def differing(node: str, *sizes_s: float) -> tuple[Profile, ...]:
+    """A node on which jobs take now so long, now so long."""
+    return tuple(profile(node, cores=0.5, jobs=jobs_of(size_s)) for size_s in sizes_s)
+
+
+def stay_differing(demands: Demands, ones: tuple[Profile, ...], begin: float, lasts_s: float = 2 * COMPARED_S) -> float:
+    """The task is there for so long; each of these looks is had for a second."""
+    at = begin
+    while at <= begin + lasts_s:
+        demands.learn("merge", ones[int(at - begin) % len(ones)], at)
+        at += 0.5
+    return at
+
+
+def test_no_machine_is_slower_for_jobs_that_differ() -> None:
+    """Merging maps takes three times as long when robots meet: whichever machine it had come to seemed slow then."""
+    demands, home, there = Demands(), *(differing(node, 0.1, 0.3, 0.15) for node in ("edge1", "edge2"))
+    at = stay_differing(demands, home, 0.0)
+    for lasts_s in (1.0, 4.5, 7.0, 2 * COMPARED_S):
+        at = stay_differing(demands, there, at, lasts_s)
+        assert demands.speed("merge", there[0]) == 1.0
+        at = stay_differing(demands, home, at)
+        assert demands.speed("merge", home[0]) == 1.0
+
+
+def test_nor_for_jobs_that_grow_when_it_has_come() -> None:
+    demands, home = Demands(), profile("edge1", cores=0.5, jobs=jobs_of(0.1))
+    small, large = differing("edge2", 0.1, 0.4)
+    at = stay(demands, home, 0.0)
+    at = stay(demands, small, at, 2.0)
+    stay(demands, large, at)
+    assert demands.speed("merge", large) == 1.0
+    assert demands.at(NOTHING, home).cpu_cores == demands.at(NOTHING, large).cpu_cores == pytest.approx(0.5)
+
+
+def test_what_is_heavier_than_the_heaviest_before_is_the_machines_doing() -> None:
+    demands, home, there = Demands(), differing("edge1", 0.1, 0.2), differing("edge2", 0.4, 0.8)
+    stay_differing(demands, there, stay_differing(demands, home, 0.0))
+    assert demands.speed("merge", there[0]) == pytest.approx(0.5), "at least: 0.2 of 0.4"
+
+
+def test_what_jobs_took_more_than_a_minute_ago_is_forgotten() -> None:
+    demands, home = Demands(), profile("edge1", cores=0.5, jobs=jobs_of(0.1))
+    at = stay(demands, profile("edge1", cores=0.5, jobs=jobs_of(0.4)), 0.0)
+    at = stay(demands, home, at, 61.0)
+    there = profile(cores=0.5, jobs=jobs_of(0.4))
+    stay(demands, there, at)
+    assert demands.speed("merge", there) == pytest.approx(0.25)
+
+
 def test_a_machine_that_has_the_task_again_at_once_is_not_judged_by_a_start_elsewhere() -> None:
     demands, home = Demands(), profile("edge1", cores=0.5, jobs=jobs_of(0.1))
     at = stay(demands, home, 0.0)
