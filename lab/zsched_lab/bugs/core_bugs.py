@@ -1320,6 +1320,13 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_gateway.py",),
     ),
     _bug(
+        "a machine is slower for a task whose jobs differ",
+        "zsched.core.gateway.demand",
+        "least_s = min(job_cpu_s, found.job_least_s or job_cpu_s)",
+        "least_s = job_cpu_s",
+        ("tests/unit/core/gateway/test_task_speed.py",),
+    ),
+    _bug(
         "a profile waits for its hearer's next deadline",
         "zsched.core.handlers.choice",
         "is_news=node.profiler.has_news or node.has_deadlines",
