@@ -161,7 +161,7 @@ def _links(spec: TaskSpec) -> Iterator[str]:
 
 ON_TOP = (
     "that is smoothing and patience alone: sampling, gathering, the vote and the commit come on top (with the "
-    "defaults 1.0 to 3.0 s were seen from a real load to the move)"
+    "defaults 0.7 to 3.0 s were seen from a real load to the move)"
 )
 LATENCY = (
     "objective latency: of the work that it gets done there the share counts that is expected within {deadline} ms "
