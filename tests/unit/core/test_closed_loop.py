@@ -47,6 +47,7 @@ MEMORY_MB = 4000.0
 READY = {"merge": WorkerState.READY}
 BOTH = Weights(cpu=0.5, memory=0.5, network=0.0)
 NO_STEP: Callable[[float], float] = lambda _: 0.0  # noqa: E731 - a default value, not a function of its own
+SAME_SIZE: Callable[[float], float] = lambda _: 1.0  # noqa: E731 - as above
 
 
 @dataclass(kw_only=True)
@@ -92,6 +93,8 @@ class Machine:
     """Its one thread waits for its turn among them: a job takes longer there, and wants to run all that time."""
     frees_at: float = math.inf
     """From then on nobody else is there."""
+    size: Callable[[float], float] = SAME_SIZE
+    """Its jobs, and so the task, take so many times the CPU at a time."""
     fewer_from: float = math.inf
     """From then on its jobs come a fifth as often."""
     works_until: float = math.inf
@@ -106,7 +109,7 @@ class Machine:
         rest = max(cpu, 0.0) * self.cores
         # A full machine gives the task what is left, half a core at least.
         needs = self.task_cores / self._speed if is_owner and now < self.works_until else 0.0
-        needs = needs / 5.0 if now >= self.fewer_from else needs
+        needs = (needs / 5.0 if now >= self.fewer_from else needs) * self.size(now)
         room = max(self.cores - rest, 0.5)
         takes = min(needs, room, self.most_cores)
         is_short = takes < needs
@@ -185,8 +188,9 @@ class Machine:
             self.told = replace(self.told, at_s=now, is_idle=True) if has_ended and self.told is not None else None
             return
         word = self.told or WorkerJobs(task="merge", incarnation=str(now), at_s=now, done=0, wait_s=0.0, age_s=0.0)
-        cpu_s = self.job_s / self._speed * (self.rub if takes < needs else 1.0)
-        wanted_hz = needs / (self.job_s / self._speed)
+        alone_s = self.size(now) * self.job_s / self._speed
+        cpu_s = alone_s * (self.rub if takes < needs else 1.0)
+        wanted_hz = needs / alone_s
         done_hz = takes / cpu_s
         before, self._done = int(self._done), self._done + elapsed_s * done_hz
         self._undone += elapsed_s * max(wanted_hz - done_hz, 0.0)
@@ -885,6 +889,29 @@ def test_jobs_that_a_load_held_up_are_no_reason_to_leave_when_it_has_ended(
     by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
     loop = Loop((machine, replace(machine, name="edge2")), weights=CPU_ONLY, tuning=by_latency, learns=True)
     assert loop.run(60.0) == []
+
+
+@pytest.mark.parametrize(("grows", "most"), [(False, 2), (True, 4)])
+@pytest.mark.parametrize("large", [4.0, 5.0])
+def test_jobs_that_differ_move_next_to_nothing_between_machines_that_are_alike(
+    large: float, most: int, *, grows: bool
+) -> None:
+    """Merging maps takes more when robots meet, and more with every metre: each machine seemed slow when it had come.
+
+    Three machines are loaded one after the other, and the task flees at most from each.
+    """
+
+    def size(now: float) -> float:
+        return 1.0 + (large - 1.0) * (min(now / 60.0, 1.0) if grows else float(now % 11.0 > 6.0))
+
+    def load_from(begin: float) -> Callable[[float], float]:
+        return lambda now: 0.9 if begin <= now < begin + 12.0 else 0.0
+
+    machine = Machine(name="edge1", cores=1.0, base=0.05, task_cores=0.3, job_s=0.05, size=size)
+    begins = (("edge1", 10.0), ("edge2", 40.0), ("edge3", 70.0))
+    machines = tuple(replace(machine, name=name, step=load_from(begin)) for name, begin in begins)
+    moves = Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True).run(120.0)
+    assert 2 <= len(moves) <= most, moves
 
 
 QUEUES = Machine(name="edge1", base=0.1, signal_dbm=-45.0, task_cores=0.5, job_s=0.06, queueing=1.0)
