@@ -163,5 +163,9 @@ def note(kind: str, error: BaseException) -> None:
 
 def calmed(now: float) -> tuple[str, ...]:
     """Kinds of which none has failed for `TOLD_S`, each once: who was told of them may be told that it is over."""
-    over = tuple((kind, at) for kind, at in tuple(_failed_at.items()) if now - at >= TOLD_S)
-    return tuple(kind for kind, at in over if _failed_at.get(kind) == at and _failed_at.pop(kind))
+    over = []
+    for kind, at in tuple(_failed_at.items()):
+        if now - at >= TOLD_S and _failed_at.get(kind) == at:  # else it has failed again meanwhile
+            del _failed_at[kind]
+            over.append(kind)
+    return tuple(over)

@@ -25,7 +25,14 @@ from zsched.commands.page import (
 )
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.words import NEVER_INITIALISED, RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
+from zsched.core.values.words import (
+    COUNTED_ANEW,
+    NEVER_INITIALISED,
+    RESTARTING,
+    WAS_READY,
+    has_lost_its_worker,
+    told_of_worker,
+)
 
 Json = dict[str, Any]
 
@@ -568,9 +575,9 @@ def _last(status: Json, stream: Json) -> str:
 def _awaited(status: Json, stream: Json) -> str:
     """Of a stream without a message: for an input, which key it waits for, and where to publish it.
 
-    What it counted before is kept when the relay starts anew, and when the stream's key is changed.
+    It keeps its count when the relay starts anew, and when its key is changed.
     """
-    told = "none since the relay's start or the stream's last change" if stream["messages"] else "nothing yet"
+    told = f"none {COUNTED_ANEW}" if stream["messages"] else "nothing yet"
     key = stream.get("from_expr") if "/in/" in stream["stream"] else None  # later fields of the schema's major version
     if not key:
         return told

@@ -339,8 +339,7 @@ class Stages:
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)
         left = frozenset(self.flags.drained)
-        owner = self.values()[spec.name].owner
-        if owner is not None and self.rounds.tasks[spec.name].judge.is_overdue(now):
+        if self.rounds.tasks[spec.name].judge.is_overdue(now) and (owner := self.values()[spec.name].owner) is not None:
             left |= {owner}
         if not in_grace and not unproven and not unfit and not unseen and not left:
             return NO_DOUBTS

@@ -11,6 +11,7 @@ from typing import Final
 from zsched.adapters.network.listeners import keys_with_listeners
 from zsched.adapters.network.stream_tap import StreamTap, Tapped
 from zsched.clock import monotonic_s
+from zsched.core.values.words import COUNTED_ANEW
 from zsched.doctor.model import Json, Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.errors import AdapterError
 
@@ -33,8 +34,7 @@ def inputs_have_publishers(scene: Scene) -> Result:
     for task, stream in streams:
         if stream["last_seen_s"] is None and task["owner"] is not None:
             told = f"{stream['stream']}: nobody has published {stream['from_expr'] or 'its key'} on {scene.node}"
-            # what came before, on another key maybe, is still in its count
-            told += " since the relay's start or the stream's last change" if stream["messages"] else ""
+            told += f" {COUNTED_ANEW}" if stream["messages"] else ""
             found.append(warned(told, fix=f"the application must put that key, and dial {_joins_at(scene)}"))
     return joined(found, passed(f"{counted(len(streams), 'inputs')}, each has had messages"))
 

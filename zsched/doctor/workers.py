@@ -41,7 +41,8 @@ def _mine(scene: Scene) -> Iterator[TaskSpec]:
 
 def commands_are_there(scene: Scene) -> Result:
     """Whether the program of each worker is there and may be run."""
-    found = [_command(task, path_of_service(scene)) for task in _mine(scene)]
+    service_path = path_of_service(scene)
+    found = [_command(task, service_path) for task in _mine(scene)]
     return joined(found, skipped("no worker is started by the daemon here"))
 
 

@@ -1329,7 +1329,7 @@ VOTE_BUGS = (
     _bug(
         "a profile waits for its hearer's next deadline",
         "zsched.core.handlers.choice",
-        "is_news=node.profiler.has_news or node.has_deadlines",
+        "is_news=node.profiler.has_news or has_deadlines",
         "is_news=node.profiler.has_news",
         ("tests/unit/core/test_node.py",),
     ),

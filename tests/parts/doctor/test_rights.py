@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +11,7 @@ from typing import Any
 import pytest
 
 from support.clinic import FLEET
-
-WITHOUT_RIGHTS = ("setpriv", "--bounding-set", "-all", "--inh-caps", "-all")
-"""Root that may read no more than others."""
+from support.rights import WITHOUT_RIGHTS
 
 
 @pytest.fixture
@@ -29,10 +26,9 @@ def closed(tmp_path: Path) -> Path:
 
 def found(closed: Path, *words: str, node: str = "edge1", runtime: Path | None = None) -> dict[str, dict[str, Any]]:
     """{check: its result}."""
-    before = WITHOUT_RIGHTS if os.geteuid() == 0 else ()
     asked = ("doctor", "--json", "--node", node, "--config", str(closed.parent / "fleet.yaml"), *words)
     folders = ("--state-dir", str(closed / "zsched"), "--runtime-dir", str(runtime or closed.parent))
-    command = [*before, sys.executable, "-m", "zsched.cli", *asked, *folders]
+    command = [*WITHOUT_RIGHTS, sys.executable, "-m", "zsched.cli", *asked, *folders]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert "Traceback" not in ended.stderr, ended.stderr
     return {one["id"]: one for one in json.loads(ended.stdout)["checks"]}

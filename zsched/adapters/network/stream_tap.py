@@ -4,7 +4,7 @@ Knows: zenoh sessions and subscribers, arrival times. Does not know: nodes, stre
 
 Who only looks must not hold up what he looks at. What waits for a reader that stands still (a terminal that is held, a
 pager) is bounded in number and in bytes; what is dropped by that is counted. What comes faster than our thread takes it
-zenoh drops without a count: then it is told that more may be missing.
+zenoh drops without a count: then the reader hears that more may be missing.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -91,7 +91,7 @@ class StreamTap:
             guarded(self._run, side, subscriber.handler, name=f"tap {key}", kind="tap").start()
 
     def _run(self, side: str, handler: zenoh.handlers.Handler[zenoh.Sample]) -> None:
-        for sample in _each(handler, self._note_overflow):
+        for sample in self._each(handler):
             attachment, payload = sample.attachment, sample.payload.to_bytes() if self._kept_bytes != 0 else b""
             tapped = Tapped(
                 side=side,
@@ -106,6 +106,24 @@ class StreamTap:
             )
             self._put(tapped)
 
+    def _each(self, handler: zenoh.handlers.Handler[zenoh.Sample]) -> Iterator[zenoh.Sample]:
+        """Each sample as it comes, and whether the ring may have dropped some.
+
+        It drops only while it is full, and what it is full of is taken in a row then, without finding it empty.
+        """
+        in_a_row = 0
+        while True:
+            try:
+                sample = handler.try_recv()
+                if sample is None:
+                    in_a_row = 0
+                    sample = handler.recv()
+            except zenoh.ZError:
+                return  # undeclared
+            in_a_row += 1
+            self.may_miss_more |= in_a_row >= RING
+            yield sample
+
     def _put(self, tapped: Tapped) -> None:
         with self._came:
             # one sample may be larger than all that is held
@@ -117,25 +135,19 @@ class StreamTap:
             self._held_bytes += len(tapped.payload)
             self._came.notify()
 
-    def _note_overflow(self) -> None:
-        self.may_miss_more = True
-
     def told(self, done: str) -> str:
         """What was missed, in words; empty: nothing. ``done``: what is made of samples."""
-        some = str(self.missed) if self.missed else "some"
-        more = ", and maybe more" if self.missed and self.may_miss_more else ""
-        maybe = "maybe " if self.may_miss_more and not self.missed else ""
-        told = f"{maybe}{some} samples{more} came faster than they could be {done}"
-        return told if self.missed or self.may_miss_more else ""
+        if not self.missed:
+            return f"maybe some samples came faster than they could be {done}" if self.may_miss_more else ""
+        more = ", and maybe more" if self.may_miss_more else ""
+        return f"{self.missed} samples{more} came faster than they could be {done}"
 
     def until(self, end: float) -> Iterator[Tapped]:
         """What comes until ``end`` (`monotonic_s`), in order of arrival."""
         while (left := end - monotonic_s()) > 0:
             with self._came:
-                if not self._samples and not self._came.wait(left):
+                if not self._came.wait_for(lambda: bool(self._samples), left):
                     return
-                if not self._samples:
-                    continue
                 tapped = self._samples.popleft()
                 self._held_bytes -= len(tapped.payload)
             yield tapped
@@ -156,27 +168,6 @@ class StreamTap:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _each(handler: zenoh.handlers.Handler[zenoh.Sample], on_overflow: Callable[[], None]) -> Iterator[zenoh.Sample]:
-    """Each sample as it comes; calls ``on_overflow`` where the ring may have dropped some.
-
-    It drops only while it is full, and what it is full of is taken in a row then, without finding it empty.
-    """
-    in_a_row = 0
-    while True:
-        try:
-            sample = handler.try_recv()
-            if sample is None:
-                in_a_row = 0
-                sample = handler.recv()
-        except zenoh.ZError:
-            return  # undeclared
-        in_a_row += 1
-        if in_a_row >= RING:
-            in_a_row = 0
-            on_overflow()
-        yield sample
 
 
 def _source(sample: zenoh.Sample) -> str:

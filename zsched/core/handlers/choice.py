@@ -19,7 +19,7 @@ from zsched.core.values.model import Proposal
 from zsched.core.values.struct import replace
 
 BLIND = f"nothing of this machine has been measured for {BLIND_S:g} s: a driver or a disk hangs; see the journal"
-"""A reader that raises is told by the sampler; one that hangs is not."""
+"""The sampler tells of a reader that raises, and can tell of none that hangs."""
 
 # --- PROFILE, GATEWAY ------------------------------------------------------------------------------------------------
 
@@ -40,11 +40,12 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
     )
     if profile is None:
         return
-    if node.has_deadlines:
+    has_deadlines = node.has_deadlines
+    if has_deadlines:
         node.round_trips.note_sent(profile, now)
     node.gateway.absorb(profile, now)
     # A profile that waits for the hearer's next deadline would seem to have been under way for so long.
-    todo.add(do.PublishProfile(profile=profile, is_news=node.profiler.has_news or node.has_deadlines))
+    todo.add(do.PublishProfile(profile=profile, is_news=node.profiler.has_news or has_deadlines))
     node.set_problem("measuring", BLIND if node.profiler.is_blind(now) else None)
     _look_for_hangs(node, todo, now)
 

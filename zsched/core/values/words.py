@@ -37,6 +37,8 @@ WAS_READY = "was ready until "
 RESTARTING = "restarting"
 """First words of the reason of a worker that has failed and is, or will be, started again."""
 NO_SPARE = "no other candidate can take it"
+COUNTED_ANEW = "since the relay's start or the stream's last change"
+"""A stream keeps its count over both, so a message in it may have come before."""
 """First words of the problem that a task is served, and no worker of another living candidate could take it over."""
 _READY = "ready"
 

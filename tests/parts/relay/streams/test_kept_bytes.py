@@ -38,5 +38,5 @@ def test_attachments_count_for_what_waits_for_an_owner(direction: Direction, mon
             publisher.put(b"x", attachment=bytes(1000))
         until(lambda: stream.count().messages == SENT, "all have come")
         assert dict(stream.count().drops) == {"overflow": SENT - FITS}
-        assert stream.count().bytes == SENT, "what is told are payloads"
+        assert stream.count().bytes == SENT, "status goes on telling the bytes of payloads"
         stream.close()

@@ -39,11 +39,7 @@ def jobs_of(cpu_s: float, *, wanted_hz: float = 5.0, done_hz: float = 5.0) -> Jo
 
 def stay(demands: Demands, one: Profile, begin: float, lasts_s: float = 2 * COMPARED_S) -> float:
     """The task is on the node of ``one``, which looks the same for so long; answers when that ends."""
-    at = begin
-    while at <= begin + lasts_s:
-        demands.learn("merge", one, at)
-        at += 0.5
-    return at
+    return stay_differing(demands, (one,), begin, lasts_s)
 
 
 def ask(
@@ -289,12 +285,12 @@ def test_a_machine_that_the_task_leaves_at_once_has_shown_how_slow_it_is() -> No
 
 
 def differing(node: str, *sizes_s: float) -> tuple[Profile, ...]:
-    """A node on which jobs take now so long, now so long."""
+    """A node as it looks while its jobs take each of these times."""
     return tuple(profile(node, cores=0.5, jobs=jobs_of(size_s)) for size_s in sizes_s)
 
 
 def stay_differing(demands: Demands, ones: tuple[Profile, ...], begin: float, lasts_s: float = 2 * COMPARED_S) -> float:
-    """The task is there for so long; each of these looks is had for a second."""
+    """The task is there for ``lasts_s``, and the node looks like each of ``ones`` for a second, in turns."""
     at = begin
     while at <= begin + lasts_s:
         demands.learn("merge", ones[int(at - begin) % len(ones)], at)
