@@ -909,7 +909,7 @@ VOTE_BUGS = (
     _bug(
         "a young suspicion takes the owner for unreachable",
         SCORING,
-        "is_spared = candidate == owner and candidate in doubts.in_grace",
+        "is_spared = candidate == self._allocation.owner and candidate in doubts.in_grace",
         "is_spared = False",
         (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
     ),
@@ -1028,7 +1028,7 @@ VOTE_BUGS = (
     _bug(
         "a task that nobody has keeps the margin of its limits",
         "zsched.core.scheduler.eligibility",
-        "has_margin=has_owner and not is_owner",
+        "has_margin=is_kept and not is_owner",
         "has_margin=not is_owner",
         ("tests/unit/core/scheduler/test_scoring.py",),
     ),

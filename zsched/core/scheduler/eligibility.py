@@ -67,12 +67,12 @@ def refusal(
     use: Use,
     gauges: Mapping[GaugeName, float],
     *,
-    has_owner: bool = True,
+    is_kept: bool = True,
 ) -> str:
     """Why the node may not have the task; empty when it may.
 
-    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``. ``has_owner``: one has the
-    task to which it could move back (`may_return`).
+    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``. ``is_kept``: the owner keeps
+    the task, or may have it back (`may_return`).
     """
     if profile.draining:
         return "draining"
@@ -87,7 +87,7 @@ def refusal(
     if not is_owner and not may_get(spec, state):
         return f"worker {state}{why}"
     return lacks_memory(profile, needed_mb, use) or _beyond_limits(
-        spec, profile, gauges, is_owner=is_owner, has_owner=has_owner
+        spec, profile, gauges, is_owner=is_owner, is_kept=is_kept
     )
 
 
@@ -109,12 +109,12 @@ def is_for_comers(reason: str) -> bool:
 
 
 def _beyond_limits(
-    spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool, has_owner: bool
+    spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool, is_kept: bool
 ) -> str:
     """Why the machine's gauges forbid the task; empty: they do not.
 
     An owner whose GPU may be busy with the task alone, for all that is known, is not left for that. A task that nobody
-    has goes to a machine inside the margin, too: there is no other one that it could move back to.
+    keeps goes to a machine inside the margin, too: there is no other one that it could move back to.
     """
     told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
     added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
@@ -125,7 +125,7 @@ def _beyond_limits(
         BY_NAME[name].fault(
             gauges.get(name),
             limit,
-            has_margin=has_owner and not is_owner,
+            has_margin=is_kept and not is_owner,
             is_reckoned=name in added,
             is_old=name not in told,
         )

@@ -14,7 +14,7 @@ from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.eligibility import has_living_owner, may_return, refusal
-from zsched.core.scheduler.links import pair_link, ways
+from zsched.core.scheduler.links import PairLink, pair_link, ways
 from zsched.core.scheduler.usage import Bookings, Use, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
     cpu_utility,
@@ -114,67 +114,30 @@ def score(
     Memory that a worker has come to use forbids a candidate that lacks it, while the task runs elsewhere. Without an
     owner the file's figure alone does: a worker that starts anew may need far less, and any place is better than none.
     """
+    view = _View(
+        spec=spec,
+        allocation=allocation,
+        voter=voter,
+        gateway=gateway,
+        states=states,
+        now=now,
+        bookings=bookings,
+        doubts=doubts,
+    )
     away_s = NOTHING_HELD
     if allocation.tuning.deadline_ms is not None:
         away_s = ways(voter, spec.candidates, round_trips, gateway, now)
-    owner = allocation.owner
-    told = None if owner is None else gateway.fresh(owner, now)
-    has_owner = owner is not None and has_living_owner(
-        spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace
-    )
-    is_kept = has_owner and owner not in doubts.left and may_return(spec, told)
-    of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
-    margin_db = own_margin_db = 0.0
-    if is_kept and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:
-        margin_db = REACH_MARGIN_DB if of_owner is None or of_owner.is_reached else 0.0
-        # the way to the access point takes no part in who is better where the owner is reached by it, too
-        own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
     refused: list[tuple[NodeId, str]] = []
     for candidate in spec.candidates:
-        state = states.get(candidate, PeerState.UNKNOWN)
-        if state is PeerState.UNKNOWN:
-            refused.append((candidate, "not heard yet"))  # we may have just started: that says nothing about it
-            continue
-        is_spared = candidate == owner and candidate in doubts.in_grace
-        if (state is not PeerState.ALIVE and not is_spared) or candidate in doubts.unseen:
+        found = view.terms(candidate, away_s.get(candidate, 0.0))
+        if found is None:
             unreachable.append(candidate)
-            continue
-        if doubt := doubts.against(candidate, owner):
-            refused.append((candidate, doubt))
-            continue
-        profile = gateway.fresh(candidate, now)
-        if profile is None:
-            refused.append((candidate, "no fresh profile"))
-            continue
-        demand, is_comer = gateway.demand(spec, profile), has_owner and candidate != owner
-        own = own_use(spec, allocation, profile, demand)
-        coming = coming_use(spec, profile, bookings, gateway, now, None if is_comer else own)
-        use = predicted(profile, own, demand, coming)
-        gauges = predicted_gauges(spec, allocation, profile, bookings, gateway, now)
-        needed = demand if is_comer else spec.demand
-        least_use = use if needed is demand else predicted(profile, own, needed, coming)
-        reason = refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, has_owner=is_kept)
-        if reason:
-            refused.append((candidate, reason))
-            continue
-        link = of_owner
-        if not has_owner or candidate != owner:
-            link = pair_link(voter, candidate, gateway, spec.limits, now, margin_db, own_margin_db)
-        if link is not None and not link.is_reached:
-            unreachable.append(candidate)
-            continue
-        fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
-        load = profile.worker(spec.name)
-        # what an owner that is short gets is measured
-        is_measured = candidate == owner and load is not None and is_short(load)
-        least = min(fair, own.cpu_cores) if is_measured else fair
-        network_s = away_s.get(candidate, 0.0)
-        cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
-        memory = _memory(spec, profile, demand, use, allocation.tuning.score)
-        weighed = _gauges(allocation, gauges)
-        terms[candidate] = _Terms(cpu, memory, None if link is None else link.utility, weighed)
+        elif isinstance(found, str):
+            refused.append((candidate, found))
+        else:
+            terms[candidate] = found
     _spare_gpu(spec, allocation, terms)
     _spare_own_link(voter, terms)
     utilities, unmeasured = _weighed(allocation.tuning, terms)
@@ -187,6 +150,86 @@ def score(
         refused=tuple(sorted((*refused, *unmeasured))),
         penalties=tuple(sorted((name, round(penalty, 4)) for name, penalty in penalties.items())),
     )
+
+
+class _View:
+    """What one robot sees of a task's candidates in one round."""
+
+    def __init__(
+        self,
+        *,
+        spec: TaskSpec,
+        allocation: Allocation,
+        voter: NodeId,
+        gateway: Gateway,
+        states: Mapping[NodeId, PeerState],
+        now: float,
+        bookings: Bookings | None,
+        doubts: Doubts,
+    ) -> None:
+        self._spec, self._allocation, self._voter, self._gateway = spec, allocation, voter, gateway
+        self._states, self._now, self._bookings, self._doubts = states, now, bookings, doubts
+        owner = allocation.owner
+        told = None if owner is None else gateway.fresh(owner, now)
+        has_owner = owner is not None and has_living_owner(
+            spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace
+        )
+        is_kept = has_owner and owner not in doubts.left and may_return(spec, told)
+        of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
+        margin_db = own_margin_db = 0.0
+        if is_kept and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:
+            margin_db = REACH_MARGIN_DB if of_owner is None or of_owner.is_reached else 0.0
+            # the way to the access point takes no part in who is better where the owner is reached by it, too
+            own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
+        self._owner = owner if has_owner else None
+        """Who has the task and works, or may; ``None``: nobody."""
+        self._is_kept = is_kept
+        self._of_owner, self._margin_db, self._own_margin_db = of_owner, margin_db, own_margin_db
+
+    def terms(self, candidate: NodeId, network_s: float) -> _Terms | str | None:
+        """Eq. 1-3 for a candidate to which ``network_s`` lead and back; why it is refused; ``None``: not reached."""
+        found = self._profile(candidate)
+        if not isinstance(found, Profile):
+            return found
+        spec, allocation, gateway, now, profile = self._spec, self._allocation, self._gateway, self._now, found
+        demand, is_comer = gateway.demand(spec, profile), self._owner is not None and candidate != self._owner
+        own = own_use(spec, allocation, profile, demand)
+        coming = coming_use(spec, profile, self._bookings, gateway, now, None if is_comer else own)
+        use = predicted(profile, own, demand, coming)
+        gauges = predicted_gauges(spec, allocation, profile, self._bookings, gateway, now)
+        needed = demand if is_comer else spec.demand
+        least_use = use if needed is demand else predicted(profile, own, needed, coming)
+        if reason := refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, is_kept=self._is_kept):
+            return reason
+        link = self._link(candidate)
+        if link is not None and not link.is_reached:
+            return None
+        fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
+        load = profile.worker(spec.name)
+        # what an owner that is short gets is measured
+        is_measured = candidate == allocation.owner and load is not None and is_short(load)
+        least = min(fair, own.cpu_cores) if is_measured else fair
+        cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
+        memory = _memory(spec, profile, demand, use, allocation.tuning.score)
+        return _Terms(cpu, memory, None if link is None else link.utility, _gauges(allocation, gauges))
+
+    def _profile(self, candidate: NodeId) -> Profile | str | None:
+        """The newest profile of a candidate that is there; why it is refused; ``None``: not reached."""
+        state, doubts = self._states.get(candidate, PeerState.UNKNOWN), self._doubts
+        if state is PeerState.UNKNOWN:
+            return "not heard yet"  # we may have just started: that says nothing about it
+        is_spared = candidate == self._allocation.owner and candidate in doubts.in_grace
+        if (state is not PeerState.ALIVE and not is_spared) or candidate in doubts.unseen:
+            return None
+        if doubt := doubts.against(candidate, self._allocation.owner):
+            return doubt
+        return self._gateway.fresh(candidate, self._now) or "no fresh profile"
+
+    def _link(self, candidate: NodeId) -> PairLink | None:
+        if candidate == self._owner:
+            return self._of_owner
+        margins = self._margin_db, self._own_margin_db
+        return pair_link(self._voter, candidate, self._gateway, self._spec.limits, self._now, *margins)
 
 
 def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utility], list[tuple[NodeId, str]]]:
