@@ -51,6 +51,18 @@ def avoid_s(limits: Limits) -> float:
     return max(AVOID_S, AVOID_M / limits.speed)
 
 
+def first_of(start: Pose2, offset: Point | None) -> Point | None:
+    """Where a robot at ``start`` drives first, in its map frame: ``offset`` away in the world's directions.
+
+    >>> first_of(Pose2(x=4.0, yaw=math.pi), (3.0, 0.0))
+    (-3.0, 0.0)
+    """
+    if offset is None:
+        return None
+    x, y = start.inverse().apply_point(start.x + offset[0], start.y + offset[1])
+    return round(x, 3), round(y, 3) + 0.0
+
+
 @dataclass(slots=True)
 class _Goal:
     frontier: Frontier
@@ -61,9 +73,13 @@ class _Goal:
 class Explorer:
     """One robot's explorer; all points are in the merged frame, but poses that are handed in by `step`."""
 
-    def __init__(self, robot: str, limits: Limits, avoid_s: float = AVOID_S) -> None:
-        """``avoid_s``: for how long a frontier does not count that the robot has been at, or could not get to."""
+    def __init__(self, robot: str, limits: Limits, avoid_s: float = AVOID_S, first: Point | None = None) -> None:
+        """``avoid_s``: for how long a frontier does not count that the robot has been at, or could not get to.
+
+        ``first``: where it drives before it chooses by itself, straight, in its own map frame; a wall ends that, too.
+        """
         self._robot = robot
+        self._first = first
         self._avoid_s = avoid_s
         self._limits = limits
         self._map: Grid | None = None
@@ -95,6 +111,8 @@ class Explorer:
     @property
     def way(self) -> tuple[Point, ...]:
         """The corners of the way that are still ahead; none: it goes nowhere."""
+        if self._first is not None and self._merged_t_map is not None:
+            return (self._merged_t_map.apply_point(*self._first),)
         return () if self._goal is None else self._goal.way[self._goal.next :]
 
     def take_map(self, grid: Grid) -> None:
@@ -120,6 +138,10 @@ class Explorer:
         """The velocity for this moment; ``pose`` is what the robot believes, in its own map frame."""
         if self._map is None or self._merged_t_map is None:
             return Twist()
+        if self._first is not None:
+            if not is_blocked and math.dist((pose.x, pose.y), self._first) >= REACHED_M:
+                return towards(self._first, pose, self._limits)
+            self._first, self._is_due = None, True
         here = self._merged_t_map.compose(pose)
         self._notice(here, now, is_blocked=is_blocked)
         if self._is_due and now >= self._next_plan_s:

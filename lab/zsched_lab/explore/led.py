@@ -8,6 +8,7 @@ Nothing is ever late, so no placing can bring robots further: it is the ceiling 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from zsched.tasks.map_merge.geometry import Pose2
@@ -15,8 +16,9 @@ from zsched.tasks.map_merge.merger import Merger, MergerSettings, Mode
 from zsched.tasks.map_merge.pairs import Rule
 from zsched_lab.explore.agent import CLAIM_PERIOD_S, Agent, RobotSettings
 from zsched_lab.explore.body import Drift, Limits
-from zsched_lab.explore.explorer import Explorer, avoid_s
+from zsched_lab.explore.explorer import Explorer, avoid_s, first_of
 from zsched_lab.explore.laser import LaserScan
+from zsched_lab.explore.planner import Point
 from zsched_lab.explore.referee import Referee
 from zsched_lab.explore.slam_state import Slam, SlamSettings
 from zsched_lab.explore.world import World
@@ -38,6 +40,8 @@ class LedRun:
     min_agreeing: int = Rule().min_agreeing
     limits: Limits = Limits()
     drift: Drift = Drift()
+    first: Mapping[str, Point] = field(default_factory=dict)
+    """{robot: where it drives first, as far from its start in the world's directions}; others choose by themselves."""
 
 
 @dataclass(slots=True, eq=False)
@@ -122,7 +126,7 @@ def _robots(plan: LedRun) -> dict[str, _Robot]:
         found[name] = _Robot(
             agent=Agent(settings, plan.world, phase=index / plan.robots),
             slam=Slam(SlamSettings(robot=name, map_period_s=plan.map_period_s)),
-            navigation=Explorer(name, plan.limits, avoid_s(plan.limits)),
+            navigation=Explorer(name, plan.limits, avoid_s(plan.limits), first_of(start, plan.first.get(name))),
         )
     return found
 

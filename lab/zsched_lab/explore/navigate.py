@@ -2,7 +2,7 @@
 
 Knows: the robot's keys, this node's data endpoint. Does not know: zsched, the world, how the robot drives.
 
-    python -m zsched_lab.explore.navigate --robot robot1 --endpoint tcp/127.0.0.1:7460 [--cores 0.01]
+    python -m zsched_lab.explore.navigate --robot robot1 --endpoint tcp/127.0.0.1:7460 [--cores 0.01] [--first 3 0]
 
     in   <robot>/pose               where SLAM found the robot (`zsched_lab.explore.slam --match`)
          <robot>/bump               it has met a wall
@@ -72,10 +72,12 @@ class Budget:
 class Navigator:
     """One robot's navigation on one session."""
 
-    def __init__(self, robot: str, session: zenoh.Session, cores: float, limits: Limits) -> None:
+    def __init__(
+        self, robot: str, session: zenoh.Session, cores: float, limits: Limits, first: tuple[float, float] | None
+    ) -> None:
         """Declare everything."""
         self._robot = robot
-        self._explorer = Explorer(robot, limits, avoid_s(limits))
+        self._explorer = Explorer(robot, limits, avoid_s(limits), first)
         self._budget = Budget(cores)
         ring = zenoh.handlers.RingChannel
         self._poses = session.declare_subscriber(f"{robot}/pose", ring(1))
@@ -172,12 +174,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--endpoint", required=True, help="this node's data endpoint, e.g. tcp/127.0.0.1:7460")
     parser.add_argument("--cores", type=float, default=0.0, help="plan again as often as this CPU allows (0: do not)")
     parser.add_argument("--speed", type=float, default=Limits().speed, help="m/s at most of the robot (0.5)")
+    parser.add_argument(
+        "--first", type=float, nargs=2, metavar=("X", "Y"), help="drive there first (m, in the robot's map frame)"
+    )
     given = parser.parse_args(arguments)
+    first = None if given.first is None else (given.first[0], given.first[1])
+    if first is not None and not all(abs(value) <= 100.0 for value in first):
+        parser.error("--first: give two distances of at most 100 m")
     if not (0.0 <= given.cores <= 64.0 and 0.0 < given.speed <= 5.0):
         parser.error("--cores must be in [0, 64] and --speed in (0, 5]")
 
     def work(session: zenoh.Session, stop: StopFlag) -> None:
-        navigator = Navigator(given.robot, session, given.cores, Limits(speed=given.speed))
+        navigator = Navigator(given.robot, session, given.cores, Limits(speed=given.speed), first)
         while not stop.is_set:
             navigator.turn(monotonic_s())
             time.sleep(POLL_S)

@@ -172,6 +172,7 @@ class InputsOf:
             resolution_m=merge_of(self._scenario, cell).resolution_m,
             slam_cores=None if loop.slam_share is None else loop.slam_share * full,
             navigate_cores=loop.navigate_share * full,
+            first=loop.first,
             map_period_s=loop.map_period_s,
             ends_at_target=loop.ends_at_target,
             is_slam_task=self._has_slam_tasks,

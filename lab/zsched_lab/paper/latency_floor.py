@@ -93,6 +93,7 @@ def free_coverage(scenario: Json, world: str, seed: int) -> float:
         min_agreeing=int(merge["min_agreeing"]),
         limits=Limits(speed=float(loop["speed"])),
         drift=ODOMETRY,
+        first=loop.get("first") or {},
     )
     return run_led(plan).mean
 

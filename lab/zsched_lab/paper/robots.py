@@ -15,6 +15,7 @@ from zsched.core.values.model import NodeId
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.explore.body import Drift
+from zsched_lab.explore.explorer import first_of
 from zsched_lab.explore.worlds import load_world
 from zsched_lab.maps.laser_log import load_log
 from zsched_lab.maps.mapping import RESOLUTION_M, displacements, truth_grid
@@ -122,6 +123,8 @@ class ExploreRobots:
     """For scan matching, which then leads the robots together with navigation; ``None``: poses are given."""
     navigate_cores: float = 0.0
     map_period_s: float = 2.0
+    first: Mapping[NodeId, tuple[float, float]] = field(default_factory=dict)
+    """{robot: where navigation leads it first, as `Exploration.first`}."""
     ends_at_target: bool = True
     is_slam_task: bool = False
     """Whether SLAM is a task of the fleet (`slam_task`), so that nothing of it is to be started beside."""
@@ -168,13 +171,23 @@ class ExploreRobots:
         navigate += ["--speed", f"{self.speed:g}"]
         if self.slam_cores is not None:
             slam += ["--match", f"{self.slam_cores:g}", "--map-period", f"{self.map_period_s:g}"]
-        modules = [] if self.is_slam_task else [slam]
-        modules += [] if self.slam_cores is None else [navigate]
+        firsts = self._firsts()
+        modules: list[tuple[list[str], Mapping[NodeId, list[str]]]] = [] if self.is_slam_task else [(slam, {})]
+        modules += [] if self.slam_cores is None else [(navigate, firsts)]
         return [
-            (node, [*module, "--robot", robot, "--endpoint", endpoints[node]])
-            for module in modules
+            (node, [*module, "--robot", robot, "--endpoint", endpoints[node], *own.get(robot, ())])
+            for module, own in modules
             for robot, node in self.slam_on.items()
         ]
+
+    def _firsts(self) -> Mapping[NodeId, list[str]]:
+        """{robot: navigation's arguments for where it drives first}."""
+        starts = load_world(self.world).starts(len(self.slam_on))
+        goals = {
+            robot: first_of(start, self.first.get(robot))
+            for robot, start in zip(sorted(self.slam_on), starts, strict=True)
+        }
+        return {robot: ["--first", f"{goal[0]:g}", f"{goal[1]:g}"] for robot, goal in goals.items() if goal is not None}
 
 
 def slam_task(robot: NodeId) -> str:

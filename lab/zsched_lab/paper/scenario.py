@@ -136,6 +136,8 @@ class Exploration:
     """Of a whole edge's CPU, for the planning beside such a SLAM: it plans again as often as that allows."""
     map_period_s: float = 2.0
     """From one map of such a SLAM to the next."""
+    first: Mapping[NodeId, tuple[float, float]] = field(default_factory=dict)
+    """{robot that such a SLAM leads: where it drives first, [x, y] m from its start in the world's directions}."""
     ends_at_target: bool = True
     """Whether a run is over when every robot holds the target; else it takes its whole time."""
 
@@ -149,6 +151,13 @@ class Exploration:
             check_range("explore.slam_share", self.slam_share, 0.0, 1.0)
             if not self.slam_on:
                 raise ValueError("explore.slam_share: say which node maps for which robot (explore.slam_on)")
+        for robot, offset in self.first.items():
+            if self.slam_share is None or robot not in self.slam_on:
+                raise ValueError(f"explore.first: {robot} is led by no SLAM (explore.slam_share, explore.slam_on)")
+            if len(offset) != 2:
+                raise ValueError(f"explore.first: {robot}: give [x, y] in m, not {list(offset)}")
+            for value in offset:
+                check_range("explore.first", value, -100.0, 100.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ import pytest
 
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Cells, Grid
-from zsched_lab.explore.body import Limits
+from zsched_lab.explore.body import Limits, Twist
 from zsched_lab.explore.explorer import AVOID_M, AVOID_S, CLAIM_LIFE_S, Explorer, State, avoid_s
 from zsched_lab.explore.frontier import Claim, Frontier, choose, find_frontiers, utility
 from zsched_lab.explore.planner import INFLATION_M, distances, plan_map, way_to
@@ -209,6 +209,32 @@ def test_its_own_pose_is_taken_through_the_mergers_transform() -> None:
     twist = one.step(Pose2(), 0.0)
     assert twist.speed == 0.0
     assert abs(twist.turn) > 1.0
+
+
+def test_a_first_drive_is_driven_straight_and_then_it_chooses_by_itself() -> None:
+    one = Explorer("robot1", Limits(), first=(2.0, 0.0))
+    assert one.step(Pose2(x=1.0), 0.0).speed == 0.0, "not before it has a map"
+    one.take_transform(Pose2(x=3.0, y=2.0, yaw=math.pi))  # the frontier is behind it
+    one.take_map(grid_of(open_to_the_right()))
+    assert one.way == (pytest.approx((1.0, 2.0)),), "in the merged frame"
+
+    assert one.step(Pose2(x=1.0), 0.0) == Twist(speed=Limits().speed)
+    assert (one.claim, one.goals) == (None, 0)
+    one.step(Pose2(x=1.7), 1.0)
+
+    assert one.state is State.DRIVING
+    assert one.claim is not None
+    assert one.way[-1][0] > 2.0
+
+
+def test_a_wall_ends_a_first_drive() -> None:
+    one = Explorer("robot1", Limits(), first=(0.0, 90.0))
+    one.take_transform(Pose2())
+    one.take_map(grid_of(open_to_the_right()))
+    one.step(Pose2(x=1.0, y=2.0), 0.0)
+    assert one.claim is None
+    one.step(Pose2(x=1.0, y=2.0), 1.0, is_blocked=True)
+    assert one.claim is not None
 
 
 def test_a_wholly_known_map_leaves_it_idle() -> None:

@@ -81,7 +81,7 @@ def options(tmp_path: Path, name: str, **given: Any) -> BenchOptions:
 
 
 def test_the_shipped_scenarios_are_found_by_name_and_nothing_else_is() -> None:
-    assert shipped_names() == ("heavy-again", "heavy-all", "heavy-oracle", "nano", "nano-moves", "paper")
+    assert shipped_names() == ("heavy-again", "heavy-all", "heavy-oracle", "nano", "nano-again", "nano-moves", "paper")
     assert shipped_scenario("paper") == scenario_path()
     assert shipped_scenario("nono") is None
     assert shipped_scenario("../paper") is None
@@ -118,6 +118,7 @@ def test_every_program_s_demand_is_the_authors_and_its_worker_goes_to_the_tasks_
 def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
     wanted = {
         "nano": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_cpu", "dyna_mem", "dyna_both", "zsched"), 5),
+        "nano-again": (("fixed_e1", "dyna_cpu", "dyna_both", "zsched"), 5),
         "nano-moves": (("dyna_both", "dyna_both_slam", "zsched", "zsched_slam"), 5),
         "heavy-again": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"), 8),
         "heavy-oracle": (("dyna_both", "zsched", "oracle"), 8),
@@ -183,6 +184,9 @@ def test_a_block_for_robots_that_explore_does_not_replay_a_log(tmp_path: Path) -
         ("quick: nono", "quick"),
         ("explore: {slam_share: 2}", "slam_share"),
         ("explore: {slam_share: 0.3}", "slam_on"),
+        ("explore: {first: {robot1: [1, 0]}}", "robot1 is led by no SLAM"),
+        ("explore: {slam_on: {r: e}, slam_share: 0.3, first: {r: [1]}}", r"give \[x, y\]"),
+        ("explore: {slam_on: {r: e}, slam_share: 0.3, first: {r: [1, 1000]}}", "explore.first"),
         ("warm_up_s: -1", "warm_up_s"),
         ("idle_floor: 2", "idle_floor"),
         ("nodes: {e: {cpu_cores: 1.0, overhead_cores: 0.6, memory_mb: 512}}", "1.6 cores"),
@@ -257,6 +261,24 @@ def test_nano_s_robots_are_led_by_slam_and_navigation_on_their_edges(tmp_path: P
     assert not robots.ends_when_covered
 
 
+def test_nano_again_is_nano_whose_robots_first_drive_is_given(tmp_path: Path) -> None:
+    nano, again = shipped("nano"), shipped("nano-again")
+    assert again.explore == replace(nano.explore, first={f"robot{number}": [3, 0] for number in (1, 2, 3)})
+    assert (again.fleet, again.merge, again.nodes, again.load) == (nano.fleet, nano.merge, nano.nodes, nano.load)
+    assert (again.level, again.levels, again.links) == (nano.level, nano.levels, nano.links)
+    endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
+
+    robots = the_robots("nano-again", tmp_path)
+    commands = [command for _, command in robots.helpers(endpoints)]
+
+    led = {command[command.index("--robot") + 1]: command for command in commands if "--first" in command}
+    assert {command[2] for command in led.values()} == {"zsched_lab.explore.navigate"}
+    for robot, start in zip(("robot1", "robot2", "robot3"), robots.frames(3, 1), strict=True):
+        at = led[robot].index("--first")
+        x, y = start.apply_point(float(led[robot][at + 1]), float(led[robot][at + 2]))
+        assert (x, y) == (pytest.approx(start.x + 3.0, abs=0.01), pytest.approx(start.y, abs=0.01))
+
+
 def test_slam_that_is_a_task_is_not_started_beside(tmp_path: Path) -> None:
     robots = the_robots("nano-moves", tmp_path)
     endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
@@ -301,6 +323,7 @@ def test_the_matrix_s_schemes_leave_slam_alone() -> None:
     ("main", "arguments"),
     [
         (navigate, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--cores", "-1"]),
+        (navigate, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--first", "1", "nan"]),
         (slam, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--match", "99"]),
         (slam_worker, ["--robot", "r", "--map-period", "0"]),
     ],
