@@ -134,7 +134,7 @@ class SystemdUnit:
 def look(arguments: Sequence[str], node: str, task: str) -> Look:
     """Whether this machine's systemd knows the unit that the driver would start with these ``arguments``."""
     unit = unit_name(_parser().parse_args(arguments).unit, node, task)
-    done = ask(SYSTEMCTL, "show", "-p", "LoadState,UnitFileState,EnvironmentFiles", unit)
+    done = ask(SYSTEMCTL, "show", "-p", "LoadState,UnitFileState,EnvironmentFiles,Restart", unit)
     if done.returncode != 0:
         return Look(told=f"systemd does not answer: {said(done)}", fix="driver: process, on a machine without systemd")
     return judged(unit, properties(done.stdout), f"{node}-{task}{ENVIRONMENT_SUFFIX}")
@@ -151,6 +151,9 @@ def judged(unit: str, shown: dict[str, str], file: str) -> Look:
     if shown.get("UnitFileState") == "enabled":
         fix = f"systemctl disable {unit}"
         return Look(told=f"{unit} is enabled: it also starts at boot, without zsched", fix=fix, is_fatal=False)
+    if (restart := shown.get("Restart", "no")) != "no":
+        told = f"{unit} has Restart={restart}: systemd starts the worker again beside zsched, which counts failures"
+        return Look(told=told, fix="Restart=no in its [Service], then: systemctl daemon-reload", is_fatal=False)
     return Look(told=f"{unit} is there")
 
 

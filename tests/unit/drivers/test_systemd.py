@@ -68,6 +68,12 @@ READS_ALL = "/run/zsched/*-shout.env (ignore_errors=no)"
             "systemctl disable",
             False,
         ),
+        (
+            {"LoadState": "loaded", "EnvironmentFiles": READS, "UnitFileState": "static", "Restart": "on-failure"},
+            "has Restart=on-failure",
+            "Restart=no",
+            False,
+        ),
         ({"LoadState": "loaded", "EnvironmentFiles": READS, "UnitFileState": "static"}, "is there", "", True),
         (
             {"LoadState": "loaded", "EnvironmentFiles": READS_ALL},
