@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from zsched.core.values.fleet import RADIO_PATIENCE, LinkLimits
-from zsched.core.values.model import PairReading
+from zsched.core.values.model import PairReading, ScoreForm
 from zsched_lab.decisions import entries
 from zsched_lab.decisions.radio import Drive, read_drive
 from zsched_lab.decisions.replay import Entry, replay
@@ -68,7 +68,7 @@ def cast(world: World) -> tuple[Entry, ...]:
         Entry(
             name="zsched by service",
             limits=entries.foreseeing(world),
-            make=entries.core(world, patience=RADIO_PATIENCE),
+            make=entries.core(world, patience=RADIO_PATIENCE, form=ScoreForm.SERVICE),
         ),
         *(
             Entry(name=f"timer, bonus {bonus:g}", make=entries.timed(world, bonus=bonus))

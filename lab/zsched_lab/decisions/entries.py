@@ -15,7 +15,7 @@ from random import Random
 from typing import Any, Final
 
 from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S, PAPER_PATIENCE, LinkLimits
-from zsched.core.values.model import PairReading, Tuning, Weights
+from zsched.core.values.model import PairReading, ScoreForm, Tuning, Weights
 from zsched_lab.decisions.replay import Entry
 from zsched_lab.decisions.rules import (
     BlindRule,
@@ -45,14 +45,16 @@ def core(
     time_to_trigger_s: float | None = None,
     cool_down_s: float | None = None,
     patience: float | None = None,
+    form: ScoreForm = ScoreForm.PAPER,
 ) -> Callable[[Sight], Rule]:
     """The production's decision; what is ``None`` is what a fleet file with ``score: paper`` gets that leaves it out.
 
-    These histories are judged by the paper's utility, so the product decides by that, too (docs/decisions/0024).
+    These histories are judged by the paper's utility, so the product decides by that, too (docs/decisions/0024), but
+    where ``form`` is `ScoreForm.SERVICE`: for the network alone both have the same terms, and service has margins.
     With a time-to-trigger it is the rule before patience, with the bonus and the cool-down that it had: those of
     `Tuning`. Signals are `foreseeing`'s affair.
     """
-    tuning = Tuning(weights=world.spec.tuning.weights)
+    tuning = Tuning(weights=world.spec.tuning.weights, score=form)
     if time_to_trigger_s is None:
         tuning = replace(tuning, bonus=DEFAULT_BONUS, cool_down_s=DEFAULT_COOL_DOWN_S)
     tuning = tuning if bonus is None else replace(tuning, bonus=bonus)

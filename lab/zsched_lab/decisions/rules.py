@@ -22,7 +22,7 @@ from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.standing import Standing, pick
 from zsched.core.values.decision import Figures, Rules
 from zsched.core.values.fleet import PAPER_PATIENCE, TaskSpec
-from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Tuning
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, ScoreForm, Tuning
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.decisions.view import Sight
 
@@ -119,7 +119,8 @@ class CoreRule:
             seats, self._due = tuple(range(len(self._judges))), math.inf
         if not seats:
             return
-        standing = self.view.standing(now)
+        by_service = self.tuning.score is ScoreForm.SERVICE
+        standing = self.view.standing(now, self._allocation if by_service else None)
         for seat in seats:
             judgement = self._judge(seat, standing, now, is_called=False)
             if judgement.outcome is Outcome.PROPOSE:

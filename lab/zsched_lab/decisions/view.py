@@ -50,8 +50,8 @@ class Sight(Protocol):
     def spec(self) -> TaskSpec:
         """The task that it decides about."""
 
-    def standing(self, now: float) -> Standing:
-        """The joint view of a gather now."""
+    def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
+        """The joint view of a gather now; ``allocation``: the rule's own, where what a machine is worth hangs on it."""
 
 
 class Feed:
@@ -113,8 +113,10 @@ class View:
         self._standing: Standing | None = None
         self._version = -1
 
-    def standing(self, now: float) -> Standing:
-        """The joint view of a gather now; computed again only when a profile has come."""
+    def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
+        """The joint view of a gather now; computed again only when a profile has come, or for ``allocation``."""
+        if allocation is not None:
+            return compare(self.spec, allocation, self._vectors(allocation, now))
         if self._standing is None or self._version != self.gateway.version:
             self._version = self.gateway.version
             vectors = self.vectors(now)
@@ -123,9 +125,11 @@ class View:
 
     def vectors(self, now: float) -> dict[NodeId, UtilityVector]:
         """{robot: its utilities now}."""
+        return self._vectors(self._allocation, now)
+
+    def _vectors(self, allocation: Allocation, now: float) -> dict[NodeId, UtilityVector]:
         return {
-            voter: score(self.spec, self._allocation, voter, self.gateway, self._states, now)
-            for voter in self.fleet.voters
+            voter: score(self.spec, allocation, voter, self.gateway, self._states, now) for voter in self.fleet.voters
         }
 
 

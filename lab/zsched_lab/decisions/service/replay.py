@@ -228,8 +228,9 @@ class TaskView:
         self._seen: tuple[int, tuple[NodeId | None, ...]] | None = None
         self._standing: Standing | None = None
 
-    def standing(self, now: float) -> Standing:
+    def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
         """The joint view of a gather now; computed again only when a profile has come or a task has moved."""
+        del allocation  # the scene has it
         seen = self.gateway.version, tuple(value.owner for value in self._scene.values.values())
         if self._standing is None or seen != self._seen:
             self._seen, self._standing = seen, self._compare(now)

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from zsched.core.scheduler.standing import Standing
+from zsched.core.values.fleet import LinkLimits
+from zsched.core.values.model import Allocation
 from zsched_lab.decisions import drives, radio
+from zsched_lab.decisions.rules import CoreRule
+from zsched_lab.decisions.view import START_S, Feed, Look, View
+from zsched_lab.decisions.world import DT_S, drives_world
 
 
 def test_path_loss_falls_by_28_db_for_every_ten_times_the_distance() -> None:
@@ -93,3 +99,47 @@ def test_drives_that_nothing_was_chosen_by_are_played_where_the_folder_has_them(
     assert len(every) == len(drives.APART) + 1
     assert {len(fleet) for fleet in every.values()} == {3}
     assert not set(drives.APART) & set(drives.FILES)
+
+
+def test_the_row_by_service_keeps_the_margin_of_a_placed_task_and_the_row_by_the_paper_s_score_does_not() -> None:
+    """The owner is just reached, another is 2.5 dB above nu: a margin of 3 dB says no."""
+    nu_dbm = LinkLimits().nu_dbm
+    levels = (nu_dbm + 0.3, nu_dbm + 2.5)
+    flat = [
+        radio.Drive(name=f"flat{level:g}", dt_s=0.2, rssi_dbm=np.full(200, level), delay_ms=np.full(200, np.nan))
+        for level in levels
+    ]
+    world = drives_world(tuple(flat), are_robots=False)
+    view = View(world, feed := Feed(world, Look()))
+    for index in range(100):
+        feed.step(index)
+    now = START_S + 100 * DT_S
+    by_name = {entry.name: entry.make(view) for entry in drives.cast(world)}
+    aggregates = {}
+    for name in ("zsched by service", "zsched"):
+        rule = by_name[name]
+        assert isinstance(rule, CoreRule)
+        placed = Allocation(task=world.spec.name, revision=1, epoch=1, owner="edge001", tuning=rule.tuning)
+        aggregates[name] = view.standing(now, placed).aggregates
+    assert set(aggregates["zsched by service"]) == {"edge001"}
+    assert aggregates["zsched"]["edge002"] > aggregates["zsched"]["edge001"]
+
+
+def test_the_row_by_service_plays_with_its_own_allocation() -> None:
+    asked: list[Allocation | None] = []
+
+    class Spy(View):
+        def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
+            asked.append(allocation)
+            return super().standing(now, allocation)
+
+    level = np.full(200, -60.0)
+    flat = radio.Drive(name="flat", dt_s=0.2, rssi_dbm=level, delay_ms=np.full(200, np.nan))
+    world = drives_world((flat, flat.shifted(1.0)), are_robots=False)
+    view = Spy(world, feed := Feed(world, Look()))
+    rule = {entry.name: entry for entry in drives.cast(world)}["zsched by service"].make(view)
+    for index in range(100):
+        feed.step(index)
+        rule.round((0,), index * DT_S, START_S + index * DT_S)
+    owners = [None if one is None else one.owner for one in asked]
+    assert owners[-1] in {"edge001", "edge002"}, "what it scores is the task where it is"
