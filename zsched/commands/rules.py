@@ -13,6 +13,7 @@ from zsched.core.scheduler.links import FORESEE_MOST_DB
 from zsched.core.scheduler.patience import CHOICES, FIRST_PATIENCE, spend
 from zsched.core.scheduler.scoring import REACH_MARGIN_DB
 from zsched.core.scheduler.utility import NEARLY_FULL
+from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.fleet import TaskSpec, Timing
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import PairReading, ScoreForm, Tuning
@@ -48,17 +49,19 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     yield f"a machine is worth {worth} (score: {tuning.score})"
     yield from _weighed(tuning)
     if tuning.deadline_ms is not None:
-        yield LATENCY.format(deadline=f"{tuning.deadline_ms:g}")
+        word = _WORD if tells_jobs(spec.worker) else _TIMED
+        yield LATENCY.format(deadline=f"{tuning.deadline_ms:g}", word=word)
     elif is_service:
         yield "it wants as many of its jobs done as possible, late ones too (objective: service)"
     floor = f"{100 * spec.memory_floor_ratio:g} %"
     if is_service:
         less = f"counts up to {100 * NEARLY_FULL:g} % less"
-        yield f"a machine that it leaves less than {floor} of the memory free {less} (memory_floor_ratio)"
+        if tuning.weights.memory > 0.0:
+            yield f"a machine that it leaves less than {floor} of the memory free {less} (memory_floor_ratio)"
         of_cpu = f"{100 * spec.cpu_floor_ratio:g} %"
-        if spec.cpu_floor_ratio > 0.0:
-            yield f"so does one that it leaves less than {of_cpu} of the CPU free (cpu_floor_ratio)"
-        else:
+        if tuning.weights.cpu > 0.0 and spec.cpu_floor_ratio > 0.0:
+            yield f"a machine that it leaves less than {of_cpu} of the CPU free {less} (cpu_floor_ratio)"
+        elif tuning.weights.cpu > 0.0:
             yield "what programs that are no tasks would still get there does not count (cpu_floor_ratio: 0)"
     else:
         yield f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)"
@@ -163,9 +166,11 @@ ON_TOP = (
     "that is smoothing and patience alone: sampling, gathering, the vote and the commit come on top (with the "
     "defaults 0.7 to 3.0 s were seen from a real load to the move)"
 )
+_WORD = "its worker's word of its jobs"
+_TIMED = "the times of its worker's answers, as the robots see them"
 LATENCY = (
     "objective latency: of the work that it gets done there the share counts that is expected within {deadline} ms "
-    "(deadline_ms), by its worker's word of its jobs (CPU per job over the machine's speed and what is free there, or "
+    "(deadline_ms), by {word} (CPU per job over the machine's speed and what is free there, or "
     "its fair share if that is more; its usual queue, and what a job waits for otherwise; what it got there before) "
     "and the measured way there and back; late work counts a tenth"
 )

@@ -12,6 +12,7 @@ from zsched.config.schema import LINK_LIMITS, SCHEDULING
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.fleet import Demand, LinkLimits, TaskSpec, Timing
 from zsched.core.values.model import PairReading, ScoreForm, Weights
+from zsched.core.values.plan import ReadyWhen
 
 TIMING = Timing()
 RADIO = tuning_of(cpu=0.5, memory=0.2, network=0.3, score=ScoreForm.SERVICE, bonus=0.05)
@@ -61,6 +62,24 @@ def test_every_setting_is_named_with_its_key() -> None:
 )
 def test_a_setting_is_told_by_what_it_does(spec: TaskSpec, said: str) -> None:
     assert said in words(spec), words(spec)
+
+
+def test_a_floor_is_told_only_where_what_it_is_of_is_weighed() -> None:
+    floors = replace(SPEC, cpu_floor_ratio=0.1)
+    both, cpu, memory = (
+        words(replace(floors, tuning=replace(RADIO, weights=Weights.of(weights))))
+        for weights in ({"cpu": 0.5, "memory": 0.5}, {"cpu": 1.0}, {"memory": 1.0})
+    )
+    assert ["(memory_floor_ratio)" in text for text in (both, cpu, memory)] == [True, False, True]
+    assert ["(cpu_floor_ratio)" in text for text in (both, cpu, memory)] == [True, True, False]
+    assert "(cpu_floor_ratio: 0)" not in memory
+
+
+def test_the_times_of_a_deadline_are_told_by_who_measures_them() -> None:
+    timed = replace(SPEC, tuning=replace(RADIO, deadline_ms=80.0))
+    assert "by its worker's word of its jobs (CPU per job" in words(timed)
+    foreign = replace(timed, worker=replace(timed.worker, ready_when=ReadyWhen.MATCHING))
+    assert "by the times of its worker's answers, as the robots see them (CPU per job" in words(foreign)
 
 
 def test_a_task_that_does_not_weigh_the_network_is_told_of_its_reach_alone() -> None:

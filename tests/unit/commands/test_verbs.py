@@ -94,7 +94,10 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
             ["of the work that it gets done there the share counts that is expected within 80 ms"],
         ),
         ("{memory_floor_ratio: 0.2}", ["less than 20 %"]),
-        ("{cpu_floor_ratio: 0.1}", ["so does one that it leaves less than 10 % of the CPU free"]),
+        (
+            "{cpu_floor_ratio: 0.1}",
+            ["a machine that it leaves less than 10 % of the CPU free counts up to 15 % less (cpu_floor_ratio)"],
+        ),
     ],
 )
 def test_check_says_in_words_when_a_task_moves(tmp_path: Path, scheduling: str, words: list[str]) -> None:
