@@ -97,7 +97,9 @@ def status_of(fleet: Fleet, node: str) -> Json:
     )
     count = len(fleet.electors)
     role = "elector" if node in fleet.electors else "no_elector"
-    quorum = QuorumStatus(electors=count, needed=count // 2 + 1, alive=count, ok=True, this_node=role)
+    quorum = QuorumStatus(
+        electors=count, needed=count // 2 + 1, alive=count, ok=True, this_node=role, names=tuple(sorted(fleet.electors))
+    )
     return snapshot_json(
         Snapshot(
             schema="zsched.status/1",

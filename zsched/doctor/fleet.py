@@ -13,7 +13,19 @@ from typing import Final, TypeVar
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, fleet_hash
 from zsched.core.values.struct import replace
 from zsched.doctor.daemon import judged_lag, lacks_of_owners, problems_of
-from zsched.doctor.model import SEAT_ADVICE, Json, Result, Scene, counted, failed, joined, passed, skipped, warned
+from zsched.doctor.model import (
+    OTHER_ELECTORS,
+    SEAT_ADVICE,
+    Json,
+    Result,
+    Scene,
+    counted,
+    failed,
+    joined,
+    passed,
+    skipped,
+    warned,
+)
 from zsched.doctor.network import addresses, connected
 
 T = TypeVar("T")
@@ -61,7 +73,13 @@ def have_one_file(scene: Scene) -> Result:
     told = [f"{name} goes by hash {found}, {scene.source} here has {mine}" for name, found in apart.items()]
     if scene.document is not None:
         return failed(*told, fix="zsched fleet show names the revision of each node, and why it does not follow")
-    return failed(*told, fix="copy the one file to all machines, and restart their daemons one after the other")
+    electors = sorted(scene.fleet.electors)
+    if any(sorted(scene.statuses[name]["quorum"]["names"]) != electors for name in apart):
+        return failed(*told, fix=OTHER_ELECTORS)
+    fix = (
+        "copy the one file to all machines, and `sudo systemctl reload zsched` on each; zsched status names what waits"
+    )
+    return failed(*told, fix=fix)
 
 
 def have_one_version(scene: Scene) -> Result:
@@ -140,7 +158,11 @@ def _register(task: str, statuses: Mapping[str, Json]) -> Iterator[Result]:
         for (revision, epoch, owner, rest), names in sorted(values.items(), reverse=True)
     ]
     if any(value[0] == newest[0] and value != newest for value in values):
-        fix = "two values of one revision: a state came from a backup or was made anew; see docs/design/failures.md"
+        fix = (
+            "two values of one revision: a state came from a backup or was made anew. What is agreed cannot be told "
+            "any more: stop every daemon, and run `sudo zsched init --generation G --force` on each, with G one above "
+            "the generation that `zsched status --json` tells (quorum)"
+        )
         yield failed(*told, fix=fix)
         return
     behind = ", ".join(name for value, names in sorted(values.items()) if value != newest for name in names)

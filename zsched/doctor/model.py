@@ -32,6 +32,11 @@ class Verdict(StrEnum):
 
 SEAT_ADVICE: Final = f"while {{names}} run: {', '.join(SEAT_AGAIN)}"
 """Of electors that the document names, and that are none."""
+OTHER_ELECTORS: Final = (
+    "the files name other electors: restart no daemon, for one that starts by the other file is no elector any more; "
+    "docs/guide/service.md, Add or remove a machine"
+)
+"""Of a daemon that goes by another fleet file, where no document is agreed."""
 _ORDER = (Verdict.SKIP, Verdict.PASS, Verdict.WARN, Verdict.FAIL)
 
 

@@ -86,7 +86,8 @@ def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:
     if new.electors != old.electors:
         yield (
             f"the electors stay {', '.join(old.electors)}: others ({', '.join(new.electors)}) need a new generation, "
-            "with every daemon stopped (`zsched init --generation N --force`)"
+            "with every daemon stopped, and until then no restart of any "
+            "(docs/guide/service.md, Add or remove a machine)"
         )
     if new.timing.lease_s != old.timing.lease_s:
         yield (

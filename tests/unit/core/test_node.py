@@ -703,7 +703,7 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
     node.handle(ev.BeatReceived(beat=strange), 100.0)
     told = f"robot2 goes by another fleet file (0123456789abcdef, here {node.fleet_file}): compare them ("
     assert node.problems["fleet/robot2"].startswith(told)
-    assert node.problems["fleet/robot2"].endswith("give all nodes the same one, restart who had another")
+    assert node.problems["fleet/robot2"].endswith("restart no daemon: docs/guide/service.md, Add or remove a machine")
     node.fleet_path = "/etc/zsched/fleet.yaml"
     node.handle(ev.BeatReceived(beat=replace(strange, sequence=2)), 100.1)
     assert f"here {node.fleet_file} of /etc/zsched/fleet.yaml)" in node.problems["fleet/robot2"]

@@ -71,8 +71,18 @@ def test_an_address_that_nobody_can_reach_is_found(tmp_path: Path) -> None:
 
 def test_a_node_with_another_file_or_version_is_found(tmp_path: Path) -> None:
     scene = fleet_scene(tmp_path)
-    assert_finds(run("fleet.files", planted(scene, "robot2", fleet_file="0" * 16)), FAIL, "robot2 goes by hash 000")
+    files = run("fleet.files", planted(scene, "robot2", fleet_file="0" * 16))
+    assert_finds(files, FAIL, "robot2 goes by hash 000")
+    assert "systemctl reload zsched" in files.fix
     assert_finds(run("fleet.versions", planted(scene, "robot2", version="0.0.9")), WARN, "zsched 0.0.9: robot2")
+
+
+def test_a_node_with_other_electors_is_not_to_be_restarted(tmp_path: Path) -> None:
+    scene = fleet_scene(tmp_path)
+    quorum = {**scene.statuses["robot2"]["quorum"], "names": ["edge1", "robot1", "robot2"]}
+    files = run("fleet.files", planted(scene, "robot2", fleet_file="0" * 16, quorum=quorum))
+    assert_finds(files, FAIL, "robot2 goes by hash 000")
+    assert "restart no daemon" in files.fix
 
 
 def test_a_pair_that_hears_one_way_only_is_found(tmp_path: Path) -> None:

@@ -118,7 +118,18 @@ def test_a_daemon_with_yesterday_s_file_is_found(tmp_path: Path) -> None:
     scene.file.write_text(FLEET.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
     newer = scene_of(tmp_path, scene.file.read_text(), own=scene.own)
     assert run("file.in_force", scene).verdict is PASS
-    assert_finds(run("file.in_force", newer), WARN, "goes by a file of hash")
+    result = run("file.in_force", newer)
+    assert_finds(result, WARN, "goes by a file of hash")
+    assert result.fix.startswith("sudo systemctl reload zsched")
+
+
+def test_a_file_with_other_electors_is_no_reason_to_restart(tmp_path: Path) -> None:
+    """A daemon that started by it would be no elector any more."""
+    scene = scene_of(tmp_path)
+    scene.file.write_text(FLEET.replace("tasks:", "electorate: [robot1]\ntasks:"))
+    result = run("file.in_force", scene_of(tmp_path, scene.file.read_text(), own=scene.own))
+    assert_finds(result, WARN, "goes by a file of hash")
+    assert "restart no daemon" in result.fix
 
 
 def test_a_file_that_is_not_the_agreed_document_is_no_fault(tmp_path: Path) -> None:

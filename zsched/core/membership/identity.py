@@ -41,7 +41,10 @@ def here(fleet_file: str, path: str) -> str:
     return f"here {fleet_file}{' of ' if path else ''}{path}"
 
 
-ONE_FILE = "compare them (`zsched check` tells a file's hash), give all nodes the same one, restart who had another"
+ONE_FILE = (
+    "compare them (`zsched check` tells a file's hash), give all nodes the same one, and `systemctl reload zsched` "
+    "where another was. If they name other electors, restart no daemon: docs/guide/service.md, Add or remove a machine"
+)
 """The advice for two different fleet files."""
 
 
