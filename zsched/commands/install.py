@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +22,7 @@ from zsched.commands.renewing import TIMER, UNIT_FOLDER
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
+from zsched.installer import is_debian_package
 from zsched.paths import authority_folders, is_there
 from zsched.runtime.membership import whose
 
@@ -206,11 +206,7 @@ def left(folders: Iterable[Path], env: Mapping[str, str]) -> list[str]:
 
 def _check(prefix: Path, root: Path) -> None:
     """Raise `CliError` where the service could not run from here, or somebody else looks after these files."""
-    try:
-        installer = (distribution("zsched").read_text("INSTALLER") or "").strip()
-    except PackageNotFoundError:
-        installer = ""
-    if installer == "dpkg":
+    if is_debian_package():
         raise CliError(EXIT_FAILED, "this zsched is a Debian package, which has done all that; apt removes it")
     if not (prefix / "share/zsched/zsched.service").is_file():
         raise CliError(

@@ -20,6 +20,7 @@ from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, ski
 from zsched.doctor.service import path_of_service, user_of_service
 from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
+from zsched.installer import is_debian_package
 
 IMPORT_S: Final = 60.0
 """numpy and OpenCV from an SD card take ten seconds and more."""
@@ -113,7 +114,10 @@ def _packages(task: TaskSpec, user: tuple[int, int] | None) -> Result | None:
         return passed(f"{task.name}: {what} finds what it imports")
     said = f"{done.stderr}\n{done.stdout}".strip().splitlines()
     why = said[-1] if said else f"status {done.returncode}"
-    fix = f"{python} -m pip install what is missing, where {task.name} runs (map_merge: zsched[map-merge])"
+    by = "apt install python3-PACKAGE" if is_debian_package() else f"{python} -m pip install PACKAGE"
+    fix = (
+        f"install what is missing where {task.name} runs: `sudo {by}`, or let `command` begin with a Python that has it"
+    )
     return failed(f"{task.name}: {what} lacks an import: {why}", fix=fix)
 
 

@@ -178,7 +178,9 @@ def _taped(path: Path, kinds: dict[str, str]) -> Iterator[Tape]:
     try:
         from mcap.writer import Writer  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise CliError(EXIT_FAILED, "MCAP cannot be written here: install the extra, pip install '.[mcap]'") from error
+        raise CliError(
+            EXIT_FAILED, "MCAP cannot be written here: install the extra mcap, as docs/guide/observe.md says"
+        ) from error
     try:
         file: BinaryIO = path.open("xb")
     except FileExistsError as error:

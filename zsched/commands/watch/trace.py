@@ -118,7 +118,8 @@ class Sender:
             from opentelemetry.sdk.trace.id_generator import IdGenerator  # noqa: PLC0415 - as above
         except ImportError as error:
             raise CliError(
-                EXIT_FAILED, "OpenTelemetry is not installed here: install the extra, pip install '.[trace]'"
+                EXIT_FAILED,
+                "OpenTelemetry is not installed here: install the extra trace, as docs/guide/observe.md says",
             ) from error
 
         class Named(IdGenerator):
