@@ -31,6 +31,7 @@ from zsched.commands.common import (
     say,
     warn,
 )
+from zsched.commands.renewing import renew_advice
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
 from zsched.core.values.fleet import Fleet
@@ -98,6 +99,7 @@ def init(where: Where, *, asks_passphrase: bool, accepted: Sequence[str] = ()) -
         if office.fleet.security is not None
         else "next: write `security: {}` and tls/ in place of tcp/ into the fleet file",
         f"next: `zsched pki issue {first}`, and so for every node",
+        renew_advice(office.folder, office.fleet.name, is_locked=bool(secret)),
     )
     return EXIT_OK
 

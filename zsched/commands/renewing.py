@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shlex
 from pathlib import Path
 from typing import Final
 
-from zsched.commands.pki import holds_authority
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.files import read_regular
@@ -36,11 +36,12 @@ def authority_here(fleet: str, config: Path, text: str = "") -> Path | None:
         config: its fleet file here, which counts where there is no ``text``.
         text: its document.
     """
+    folder = authority_folder(None, os.environ, fleet)
     try:
-        folder = holds_authority(fleet, None)
+        is_here = (folder / AUTHORITY_RECORD).exists()
     except PermissionError:  # who may not look into it renews nothing by it
-        folder = None
-    if folder is None or not _is_secured(text, config) or _named(folder) not in (fleet, None):
+        is_here = False
+    if not is_here or not _is_secured(text, config) or _named(folder) not in (fleet, None):
         return None
     return folder
 
