@@ -48,6 +48,7 @@ from zsched.core.values.plan import (
 )
 from zsched.core.values.words import PAPER_METRICS
 
+ROS_DOMAIN: Final = "ROS_DOMAIN_ID"
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
 _ANY_CANDIDATES: Final = (NOBODY,)
@@ -71,6 +72,8 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
             tasks.append(task)
             _advise_network(task.tuning, entry.value, cast, out)
             _advise_deadline(task.tuning, task.worker, entry.value, out)
+            _advise_cpu_floor(task, entry.value, out)
+            _advise_domain(task.worker, entry.value, out)
             _advise_gpu(task, entry.value, out)
             _advise_gpu_limit(task, entry.value, out)
     split = frozenset(node.name for node in cast.nodes if node.local is not None)
@@ -278,6 +281,28 @@ def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Co
             scheduling.where("objective"),
             TELLS_NOTHING,
             "put the input's timestamp on each answer (docs/guide/worker.md), or use zsched.worker (ready: token)",
+        )
+
+
+def _advise_cpu_floor(task: TaskSpec, given: Section, out: Collector) -> None:
+    if task.cpu_floor_ratio > 0.0 and task.tuning.score is ScoreForm.PAPER:
+        scheduling: Section = given.get("scheduling")
+        message = "cpu_floor_ratio changes nothing: score: paper counts the free share of the CPU anyway (Eq. 1)"
+        out.warn(scheduling.where("cpu_floor_ratio"), message, "delete it, or delete `score: paper`")
+
+
+def _advise_domain(worker: WorkerSpec, given: Section, out: Collector) -> None:
+    """The worker's nodes and the rules' keys belong to two domains: nothing that one puts reaches the other."""
+    ros2, domain = given.get("ros2"), dict(worker.env).get(ROS_DOMAIN)
+    if ros2 is None or domain is None or ros2.get("bridge", RosGraph.RMW_ZENOH) is not RosGraph.RMW_ZENOH:
+        return
+    if domain != str(ros2.get("domain", 0)):
+        section: Section = given.get("worker")
+        message = (
+            f"{ROS_DOMAIN} is {domain} for the worker, and the task's streams are of domain {ros2.get('domain', 0)}"
+        )
+        out.warn(
+            section.get("env")[ROS_DOMAIN].place, message, f"ros2: {{domain: {domain}}}, or {ROS_DOMAIN}: of that one"
         )
 
 

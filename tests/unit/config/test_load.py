@@ -832,6 +832,21 @@ tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
 
 
 @pytest.mark.parametrize(
+    ("scheduling", "is_told"),
+    [
+        ("{score: paper, cpu_floor_ratio: 0.2}", True),
+        ("{score: paper, cpu_floor_ratio: 0}", False),
+        ("{cpu_floor_ratio: 0.2}", False),
+    ],
+)
+def test_a_cpu_floor_that_the_paper_s_score_does_not_know_is_a_warning(scheduling: str, *, is_told: bool) -> None:
+    text = "fleet: f\nnodes: {r1: {kind: robot}}\n"
+    result = check(f"{text}tasks: {{t: {{candidates: [r1], weights: {{cpu: 1}}, scheduling: {scheduling}}}}}\n")
+    assert result.fleet is not None, "a running fleet may have such a file"
+    assert any("cpu_floor_ratio changes nothing" in one.message for one in result.warnings) is is_told
+
+
+@pytest.mark.parametrize(
     ("settings", "word"),
     [
         ("weights: {cpu: 0.5, gpu: 0.5}", "the GPU has a weight"),
