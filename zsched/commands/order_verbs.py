@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 TaskArgument = Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")]
 TasksArgument = Annotated[list[str] | None, typer.Argument(metavar="[TASK]...", help="Tasks of the fleet file.")]
 ReasonOption = Annotated[
-    str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; status and history of every node show it.")
+    str,
+    typer.Option(
+        "--reason", "-m", metavar="TEXT", help="Why; the history tells it, and of an order in force status, too."
+    ),
 ]
 RevisionOption = Annotated[
     int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the task's revision.")
@@ -147,7 +150,8 @@ def tune(
         list[str] | None,
         typer.Argument(
             metavar="[KEY=VALUE]...",
-            help="Weights (cpu, memory, network) and all of scheduling and link, as bonus=0.2; null: the file's.",
+            help="Weights (of gauges, too), all of scheduling (deadline_ms, not objective) and link, as bonus=0.2; "
+            "null: the file's.",
         ),
     ] = None,
     reason: ReasonOption = "",
@@ -250,7 +254,7 @@ def maint(
     runtime_dir: RuntimeOption = None,
     connect: ConnectOption = None,
 ) -> None:
-    """List every order in force with its author and reason, of tasks and of nodes, and the nodes that stop."""
+    """List pins, pauses and flags in force with author and reason, and the nodes that stop (tunings: `tune`)."""
     from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.maint import maint as show  # noqa: PLC0415 - as above
 

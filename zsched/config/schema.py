@@ -223,7 +223,7 @@ _SHARE: Final = Number(0, 1)
 
 
 def _weight_told(gauge: Gauge) -> str:
-    unknown = "cannot have the task" if gauge.is_needed else "counts 1"
+    unknown = "cannot have the task while another candidate has one" if gauge.is_needed else "counts 1"
     best, worst = gauge.shown(gauge.best), gauge.shown(gauge.worst)
     return f"Weight of {gauge.says}: {best} is worth 1, {worst} nothing. A node without it {unknown}."
 
@@ -448,7 +448,7 @@ FLEET: Final = Record(
         "electorate": Field(
             Forms(word=Choice({"auto": ()}), listing=_NAMES, mapping=SELECTOR),
             "Who stores the allocations and agrees on them; `auto`: the robots at first (where there is none, all "
-            "nodes), and who follows an elector that is gone is agreed.",
+            "nodes), and who follows an elector that is gone is agreed, once there is a document (`zsched apply`).",
             default="`auto`",
         ),
         "zenoh": Field(

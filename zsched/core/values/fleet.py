@@ -438,13 +438,14 @@ class Fleet:
     """Whether electors are replaced by themselves (`electorate: auto`, or none named) once a document is agreed."""
     replace_s: float = key(
         10.0,
-        "An elector that is not heard for this long is replaced, where the electors are not named.",
+        "An elector that is not heard for this long is replaced, where the electors are not named and a document is "
+        "agreed (`zsched apply`).",
         Range(1, 3600, "s"),
     )
     away_s: float = key(
         60.0,
         "A robot that the electors have not heard for this long does not count in votes until it is heard again; "
-        "at least `replace_s`.",
+        "at least `replace_s`. Only where a document is agreed.",
         Range(1, 604800, "s"),
     )
     seeds: tuple[NodeId, ...] = ()
