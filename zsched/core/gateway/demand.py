@@ -146,12 +146,15 @@ class Demands:
         if load is not None and load.state is not WorkerState.READY and known.owner == profile.node:
             # once it is ready its use rises from nothing, as after a move
             self._known[task] = replace(known, owner=None)
-        if load is None or load.state is not WorkerState.READY or profile.cpu_used_cores is None:
+        if load is None or load.state is not WorkerState.READY:
             return False
         if known.owner != profile.node:
             known = _came(known, profile.node, now)
             self._spending.pop(task, None)
         found = replace(known, seen_s=now)
+        if profile.cpu_used_cores is None:  # it is there, and shows by its memory all the same
+            self._known[task] = found
+            return False
         if is_full(profile):
             found = replace(found, full_at=now)
         is_new, is_calm = now - found.since < SETTLE_S, now - found.full_at > CALM_S

@@ -57,6 +57,17 @@ def test_what_the_task_s_own_worker_uses_is_not_counted_twice() -> None:
     assert seen(load("map"), memory=1150.0).memory != idle.memory
 
 
+def test_a_task_that_came_to_a_machine_whose_cpu_is_not_measured_shows_there_after_a_while() -> None:
+    """It was booked on top of the machine's memory for good: the other task found no room where there was some."""
+    gateway = Gateway(fleet_of(*TASKS, of=("edge1", "edge2", "robot1"), electors=("robot1",)))
+    for step, owner in enumerate(["edge1"] * 4 + ["edge2"] * 40):
+        now = 10.0 + 0.5 * step
+        held = profile_of(owner, sequence=step, cpu_used_cores=None, workers=(load("plan"),))
+        assert gateway.absorb(held, now) is None
+        gateway.learn_demand("plan", owner, now)
+    assert gateway.demands.unshown_ratio("plan", "edge2", now) == pytest.approx(0.0, abs=0.01)
+
+
 @pytest.mark.parametrize(
     ("shown", "cpu", "memory"),
     [
