@@ -16,7 +16,7 @@ from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead,
 from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, NodeId, PeerState
+from zsched.core.values.model import Allocation, NodeId, PeerState, ScoreForm
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 
@@ -51,10 +51,15 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
     standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
     standing = _leave_to_others(standing, figures)
-    if escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile):
+    is_short = escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile)
+    if allocation.tuning.score is ScoreForm.PAPER:
         roomy = _with_room(standing, figures)
-        # where all are short of memory, to flee would only be to come back
-        standing, escape = (roomy, escape) if roomy.aggregates.keys() - {allocation.owner} else (standing, None)
+        has_other = bool(roomy.aggregates.keys() - {allocation.owner})
+        may_stay = escape is None and allocation.owner in roomy.aggregates
+        if is_short and not has_other:
+            escape, is_short = None, False  # where all are short of memory, to flee would only be to come back
+        elif is_short or (not allocation.is_bound and (has_other or may_stay)):
+            standing = roomy
     needed = _robots_needed(figures, is_escape=escape is not None)
     if standing.voters_heard < needed:
         reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
@@ -74,8 +79,9 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
         )
     if escape is None:
         judgement = _look_ahead(judge, judgement, standing, figures)
-    is_planned = judgement.outcome is Outcome.PROPOSE and not judgement.is_escape
-    is_waiting = is_planned and figures.first is not None
+    # two tasks that flee from one machine for its memory would both find room on another, and both flee from there
+    can_wait = judgement.outcome is Outcome.PROPOSE and (not judgement.is_escape or is_short)
+    is_waiting = can_wait and figures.first is not None
     if is_waiting:
         # the figures are read again before it is judged once more
         judgement = _put_off(judgement, allocation, f"{figures.first} moves first")
@@ -162,7 +168,7 @@ def _leave_to_others(standing: Standing, figures: Figures) -> Standing:
 
 
 def _with_room(standing: Standing, figures: Figures) -> Standing:
-    """The standing without the candidates that would be left again at once, for the same want of memory."""
+    """The standing without the candidates that would be left at once for want of memory, by the paper's score."""
     short = {
         one.candidate: f"would have {one.memory * 100:.0f} % of its memory free"
         for vector in standing.vectors

@@ -14,10 +14,11 @@ import pytest
 
 from support.decisions import figures_of
 from support.fleets import fleet_of, task_of, tuning_of
+from support.plays import FLEET
 from support.profiles import load_of, profile_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Figures
-from zsched.core.values.fleet import Fleet, WorkerSpec
+from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.model import NodeId, ScoreForm, TaskId, Utility, UtilityVector
 from zsched.core.values.profile import WorkerState
 from zsched.errors import InvariantError
@@ -176,6 +177,41 @@ def test_where_all_are_short_of_memory_nobody_is_fled_from() -> None:
     decided = decide_again(full(has_room=False))
     assert (decided.escape, decided.judgement.is_escape) == (None, False)
     assert decided.judgement.reason.startswith("edge2 leads by 0.5"), "cool-down and patience hold it as ever"
+
+
+def test_nothing_better_is_on_a_machine_that_would_be_left_for_its_memory_at_once() -> None:
+    """A task went by plan to the machine with free cores, fled from it for its memory, and so on: 12 times a minute."""
+    roomy = replace(full(has_room=True), owner_profile=profile_of("edge1", workers=(load_of(),)))
+    decided = decide_again(roomy)
+    assert decided.escape is None
+    assert decided.judgement.candidate != "edge2"
+    assert decided.standing.vetoed == {"edge2": "would have 4 % of its memory free"}
+    alone = replace(roomy, vectors=full(has_room=False).vectors)
+    assert set(decide_again(alone).standing.aggregates) == {"edge1"}, "the owner stays, though edge2 is worth more"
+    homeless = replace(alone, allocation=replace(alone.allocation, owner=None), owner_profile=None)
+    assert decide_again(homeless).standing.vetoed == {}, "any place is better than none"
+
+
+def test_of_two_tasks_that_are_short_of_memory_on_one_machine_one_leaves() -> None:
+    """Both fled in one round to the same machine, and both fled back: 68 moves in a minute."""
+    tuning = tuning_of(cpu=0.5, memory=0.5, score=ScoreForm.PAPER, cool_down_s=2.0)
+    demand = Demand(cpu_cores=0.1, memory_mb=1500.0)
+    first = replace(FLEET.tasks[0], exclusive=False, demand=demand, tuning=tuning)
+    tasks = tuple(replace(first, name=name) for name in ("merge", "plan"))
+
+    def load(node: str, _now: float) -> tuple[float, float]:
+        own = sum(sim.agreed(one.name) == node for one in tasks)
+        return 1.0 + 0.1 * own, 900.0 + 1500.0 * own
+
+    sim = Simulator(fleet=replace(FLEET, tasks=tasks), seed=2, load=load)
+    sim.start(*ROBOTS, "edge1")
+    assert sim.run_until(lambda: all(sim.agreed(one.name) == "edge1" for one in tasks), 30.0)
+    sim.run(3.0)
+    before = len(sim.owners)
+    sim.start("edge2")
+    sim.run(30.0)
+    assert sorted(str(sim.agreed(one.name)) for one in tasks) == ["edge1", "edge2"]
+    assert len(sim.owners) == before + 1
 
 
 def test_a_task_does_not_go_round_between_machines_that_are_all_short_of_memory() -> None:

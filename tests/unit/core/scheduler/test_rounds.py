@@ -611,7 +611,8 @@ class RobotOfOrphans(RobotOfTwo):
     def __init__(self, me: str, free_mb: float, *, plan_on: tuple[str, ...] = ("edge1", "edge2", "robot3")) -> None:
         super().__init__(me)
         (merge, _) = self.rounds.tasks.values()
-        need = replace(merge.file, candidates=("edge1", "edge2", "robot3"), demand=Demand(memory_mb=1400.0))
+        candidates, demand = ("edge1", "edge2", "robot3"), Demand(memory_mb=1400.0)
+        need = replace(merge.file, candidates=candidates, demand=demand, memory_floor_ratio=0.0)
         fleet = replace(FLEET, tasks=(need, replace(need, name="plan", candidates=plan_on)))
         self.gateway = Gateway(fleet)
         self.decider = Decider(fleet, me, self.gateway, now=self.now)
