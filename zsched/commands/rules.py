@@ -154,7 +154,7 @@ def _links(spec: TaskSpec) -> Iterator[str]:
     yield f"a robot does not reach a candidate whose signal is below {limits.nu_dbm:g} dBm (link.nu_dbm)"
     if spec.tuning.score is ScoreForm.SERVICE:
         least = f"{limits.nu_dbm + REACH_MARGIN_DB:g} dBm"
-        yield f"while it reaches the owner, a candidate's own signal counts from {least} on, so it moves a task once"
+        yield f"while the owner is reached, another one's own signal counts from {least} on, so it moves a task once"
     if spec.tuning.weights.network > 0.0:
         yield f"a signal is worth 0 at {limits.nu_dbm:g} dBm and 1 from {limits.rho_dbm:g} dBm on (link.rho_dbm)"
         yield f"through one access point {_PAIR[limits.pair]} counts (link.pair: {limits.pair})"

@@ -36,6 +36,8 @@ class PairLink(Struct, frozen=True):
 
     is_reached: bool
     utility: float
+    at_limit: bool = False
+    """Reached, but not with the margins that were asked for."""
     is_direct: bool = True
     """Measured between the two; otherwise the robot's own way to the access point or the cable is a part of it."""
 
@@ -51,7 +53,7 @@ def pair_link(
 ) -> PairLink | None:
     """Eq. 3 for one (robot, candidate) pair, or ``None`` when nobody measured it.
 
-    A candidate is reached from ``margin_db`` above nu on, the access point by the robot's own radio from
+    A candidate is at its limit up to ``margin_db`` above nu, the access point by the robot's own radio up to
     ``own_margin_db`` above it (docs/decisions/0130).
 
     A link measured between the two counts as it is, from either end. Else both reach each other through one access
@@ -59,19 +61,25 @@ def pair_link(
     """
     if voter == candidate:
         return PairLink(is_reached=True, utility=1.0)
-    ends, least_dbm = (gateway.fresh(voter, now), gateway.fresh(candidate, now)), limits.nu_dbm + margin_db
-    own_least_dbm = limits.nu_dbm + own_margin_db
+    ends, nu_dbm = (gateway.fresh(voter, now), gateway.fresh(candidate, now)), limits.nu_dbm
     for end, other in ((ends[0], candidate), (ends[1], voter)):
         direct = None if end is None else _way(end, other, limits)
         if direct is not None:
-            return PairLink(is_reached=direct.now_dbm >= least_dbm, utility=_worth(direct.ahead_dbm, limits))
+            signal_dbm = direct.now_dbm
+            return PairLink(
+                is_reached=signal_dbm >= nu_dbm,
+                utility=_worth(direct.ahead_dbm, limits),
+                at_limit=nu_dbm <= signal_dbm < nu_dbm + margin_db,
+            )
     if ends[0] is None or ends[1] is None:
         return None
     own, its = _way(ends[0], None, limits), _way(ends[1], None, limits)
     if own is None or its is None:
         return None
-    is_reached = own.now_dbm >= own_least_dbm and its.now_dbm >= least_dbm
-    return PairLink(is_reached=is_reached, utility=_joint(own, its, limits), is_direct=False)
+    is_reached = min(own.now_dbm, its.now_dbm) >= nu_dbm
+    is_clear = own.now_dbm >= nu_dbm + own_margin_db and its.now_dbm >= nu_dbm + margin_db
+    at_limit = is_reached and not is_clear
+    return PairLink(is_reached=is_reached, utility=_joint(own, its, limits), at_limit=at_limit, is_direct=False)
 
 
 def _joint(own: Way, its: Way, limits: LinkLimits) -> float:

@@ -41,9 +41,10 @@ def _is_like(new: UtilityVector, old: UtilityVector) -> bool:
     return _is_near(*utilities) and _is_near(dict(new.penalties), dict(old.penalties))
 
 
-def _names(vector: UtilityVector) -> tuple[list[NodeId], list[NodeId]]:
-    """Who is refused, and who is out of reach."""
-    return [name for name, _ in vector.refused], [one.candidate for one in vector.utilities if not one.reachable]
+def _names(vector: UtilityVector) -> tuple[list[NodeId], list[NodeId], list[NodeId]]:
+    """Who is refused, who is out of reach, and who is at the limit of its signal."""
+    lost = [one.candidate for one in vector.utilities if not one.reachable]
+    return [name for name, _ in vector.refused], lost, [one.candidate for one in vector.utilities if one.at_limit]
 
 
 def _is_near(new: Mapping[NodeId, float], old: Mapping[NodeId, float]) -> bool:

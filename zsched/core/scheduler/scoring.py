@@ -42,8 +42,8 @@ from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import GaugeName
 
 REACH_MARGIN_DB = 3.0
-"""A robot that reaches the owner reaches another candidate only from so much above nu on: twice what a smoothed signal
-scatters by, so that one that stands about nu moves a task once (docs/decisions/0130)."""
+"""A candidate is at its limit up to so much above nu: twice what a smoothed signal scatters by. While the robots reach
+the owner it does not count there, so that a signal that stands about nu moves a task once (docs/decisions/0130)."""
 
 
 _NAMES = {
@@ -60,6 +60,7 @@ class _Terms(Struct, frozen=True):
     memory: float | None
     network: float | None
     gauges: Mapping[str, float]
+    at_limit: bool = False
 
     def names(self) -> frozenset[str]:
         """The measured metrics."""
@@ -177,8 +178,8 @@ class _View:
         is_kept = has_owner and owner not in doubts.left and may_return(spec, told)
         of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
         margin_db = own_margin_db = 0.0
-        if is_kept and allocation.tuning.score is ScoreForm.SERVICE and owner not in doubts.unseen:
-            margin_db = REACH_MARGIN_DB if of_owner is None or of_owner.is_reached else 0.0
+        if is_kept and allocation.tuning.score is ScoreForm.SERVICE:
+            margin_db = REACH_MARGIN_DB
             # the way to the access point takes no part in who is better where the owner is reached by it, too
             own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
         self._owner = owner if has_owner else None
@@ -211,7 +212,8 @@ class _View:
         least = min(fair, own.cpu_cores) if is_measured else fair
         cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
         memory = _memory(spec, profile, demand, use, allocation.tuning.score)
-        return _Terms(cpu, memory, None if link is None else link.utility, _gauges(allocation, gauges))
+        weighed, at_limit = _gauges(allocation, gauges), link is not None and link.at_limit
+        return _Terms(cpu, memory, None if link is None else link.utility, weighed, at_limit)
 
     def _profile(self, candidate: NodeId) -> Profile | str | None:
         """The newest profile of a candidate that is there; why it is refused; ``None``: not reached."""
@@ -262,6 +264,7 @@ def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utili
                 memory=term.memory,
                 network=term.network,
                 gauges=tuple(sorted(by_gauge.items())),
+                at_limit=term.at_limit,
             )
         )
     return utilities, refused

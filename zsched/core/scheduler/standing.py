@@ -13,7 +13,7 @@ from zsched.core.scheduler.damping import MAX_PENALTY
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 
 RESOLUTION = 1 / 1024
 """Aggregates are compared to this: half of what a tenth of a machine's free share is worth (0132)."""
@@ -47,7 +47,11 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
         allocation: the current one; vectors under another revision are not counted.
         vectors: {voter: its vector}, the fresh ones only.
     """
-    fresh = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
+    told = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
+    needed = len(told) if spec.reach is Reach.ALL else majority(len(told))
+    fresh = told
+    if allocation.owner is not None and _reaching(allocation.owner, told) >= needed:
+        fresh = tuple(_with_margin(vector, allocation.owner) for vector in told)
     columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
     reasons: dict[NodeId, str] = {}
     for vector in fresh:
@@ -60,12 +64,13 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
     for candidate in spec.candidates:
         column = columns[candidate]
         reaching = sum(utility.reachable for utility in column)
-        needed = len(fresh) if spec.reach is Reach.ALL else majority(len(fresh))
         if len(column) < majority(len(fresh)) or len(column) == reaching < needed:
             # Not scored is not "not reached": only the latter is a reason to flee from an owner.
             vetoed[candidate] = reasons.get(candidate, "not scored by enough robots")
         elif reaching < needed:
-            vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots"
+            at_limit = _reaching(candidate, told) - reaching
+            told_of = f", by {at_limit} more at the limit of the signal (link.nu_dbm)" if at_limit else ""
+            vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots{told_of}"
         else:
             kept.append(candidate)
     return Standing(
@@ -75,6 +80,22 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
         voters_heard=len(fresh),
         penalties=joined(dict(vector.penalties) for vector in fresh),
     )
+
+
+def _reaching(candidate: NodeId, vectors: tuple[UtilityVector, ...]) -> int:
+    """By how many robots a candidate is reached, at the limit of its signal, too."""
+    return sum(any(one.candidate == candidate and one.reachable for one in vector.utilities) for vector in vectors)
+
+
+def _with_margin(vector: UtilityVector, owner: NodeId) -> UtilityVector:
+    """A robot's utilities while the owner is reached: another candidate at the limit of its signal is not."""
+    if not any(one.at_limit and one.candidate != owner for one in vector.utilities):
+        return vector
+    near = tuple(
+        Utility(candidate=one.candidate, value=0.0, reachable=False) if one.at_limit and one.candidate != owner else one
+        for one in vector.utilities
+    )
+    return replace(vector, utilities=near)
 
 
 def mean_of(aggregate: Aggregate) -> Callable[[list[float]], float]:

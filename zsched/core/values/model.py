@@ -266,6 +266,8 @@ class Utility(Struct, frozen=True, kw_only=True):
     reachable: bool = True
     gauges: Readings = ()
     """The terms of the gauges that the task weighs."""
+    at_limit: bool = False
+    """Reached, but with so weak a signal that it is not while the task has an owner that the robots reach (0130)."""
 
     def __post_init__(self) -> None:
         check_name("utility.candidate", self.candidate)

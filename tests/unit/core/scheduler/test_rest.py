@@ -29,6 +29,7 @@ def test_an_answer_is_like_one_with_figures_that_differ_by_less_than_a_news() ->
         replace(OLD, refused=(("edge3", "no fresh profile"),)),
         replace(OLD, penalties=(("edge1", 0.1),)),
         replace(OLD, utilities=(OLD.utilities[0], replace(OLD.utilities[1], reachable=False))),
+        replace(OLD, utilities=(OLD.utilities[0], replace(OLD.utilities[1], at_limit=True))),
     ],
 )
 def test_an_answer_that_could_lead_to_another_decision_is_not_like_it(new: UtilityVector) -> None:

@@ -20,6 +20,7 @@ from zsched.core.values.model import (
     Allocation,
     PairReading,
     PeerState,
+    Reach,
     ScoreForm,
     Tuning,
     Utility,
@@ -238,6 +239,12 @@ def test_a_candidate_that_is_not_alive_gets_zero_and_is_not_left_out(state: Peer
     assert vector.refused == ()
 
 
+def reached(vector: UtilityVector, *, agreed: Allocation, spec: TaskSpec = SPEC) -> dict[str, bool]:
+    """{candidate: whether it is reached}, as all robots say it that score as this one does."""
+    (joint,) = compare(spec, agreed, {vector.voter: vector}).vectors
+    return {one.candidate: one.reachable for one in joint.utilities}
+
+
 def test_a_link_below_nu_is_zero_even_without_weight_at_nu_it_is_reached() -> None:
     edges = (profile("edge1", links=radio(-80.1)), profile("edge2", links=radio(-80.0)), profile("edge3"))
     vector = scored(ROBOT, *edges, agreed=allocation(CPU))
@@ -259,12 +266,75 @@ def test_who_reaches_the_owner_reaches_another_candidate_from_a_margin_on(
     edges = (profile("edge1", links=radio(own)), profile("edge2", links=radio(theirs)))
     by_service = replace(allocation(), tuning=tuning)
     vector = scored(ROBOT, *edges, agreed=by_service)
-    assert vector.utilities[1].reachable is is_reached
+    assert reached(vector, agreed=by_service)["edge2"] is is_reached
     assert vector.utilities[0].reachable is (own is None or own >= -80.0)
     for free in (replace(by_service, owner=None), allocation()):
-        assert scored(ROBOT, *edges, agreed=free).utilities[1].reachable, "nobody has it, or the paper's score"
+        free_vector = scored(ROBOT, *edges, agreed=free)
+        assert reached(free_vector, agreed=free)["edge2"], "nobody has it, or the paper's score"
     gone = scored(ROBOT, *edges, agreed=by_service, states={"edge1": PeerState.GONE})
-    assert gone.utilities[1].reachable
+    assert reached(gone, agreed=by_service)["edge2"]
+
+
+RADIO_ONLY_LIMIT = {"edge1": -60.0, "edge2": -78.0}
+"""A robot that reaches both, the second one at the limit of its signal."""
+NO_OWNER = {"edge1": -90.0, "edge2": -60.0}
+"""A robot that does not reach the owner."""
+
+
+@pytest.mark.parametrize(
+    ("signals", "reach", "can_have_it", "why"),
+    [
+        # the owner is not reached by enough: a machine that both reach is better than none
+        ([RADIO_ONLY_LIMIT, NO_OWNER], Reach.MAJORITY, True, ""),
+        ([RADIO_ONLY_LIMIT, NO_OWNER, {"edge1": -60.0, "edge2": -60.0}], Reach.ALL, True, ""),
+        ([RADIO_ONLY_LIMIT, NO_OWNER, {"edge1": -90.0, "edge2": -90.0}], Reach.MAJORITY, True, ""),
+        # it is: also for a robot that does not reach it, a signal at the limit does not count
+        (
+            [{"edge1": -60.0, "edge2": -60.0}, {"edge1": -60.0}, {"edge1": -90.0, "edge2": -78.0}],
+            Reach.MAJORITY,
+            False,
+            "reached by 1 of 3 robots, by 1 more at the limit of the signal (link.nu_dbm)",
+        ),
+    ],
+)
+def test_the_margin_hangs_on_whether_the_robots_reach_the_owner_and_not_on_one_of_them(
+    signals: list[dict[str, float]], reach: Reach, why: str, *, can_have_it: bool
+) -> None:
+    """Each for itself: the one that still saw the owner kept the task there, the one that did not brought it back."""
+    spec = replace(SPEC, reach=reach)
+    agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    robots = [
+        profile(
+            f"robot{number}",
+            state=None,
+            links=tuple(
+                Link(source=LinkSource.NL80211, peer=edge, rssi_dbm=heard.get(edge, -95.0))
+                for edge in ("edge1", "edge2")
+            ),
+        )
+        for number, heard in enumerate(signals, 1)
+    ]
+    vectors = {
+        robot.node: scored(*robots, profile("edge1"), profile("edge2"), spec=spec, agreed=agreed, voter=robot.node)
+        for robot in robots
+    }
+    standing = compare(spec, agreed, vectors)
+    assert ("edge2" in standing.aggregates) is can_have_it
+    assert standing.vetoed.get("edge2", "") == why
+
+
+def test_a_candidate_at_the_limit_counts_nothing_for_who_hears_it_so_while_the_owner_is_reached() -> None:
+    agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    near, far = (
+        scored(ROBOT, *EDGES, agreed=agreed),
+        scored(ROBOT, profile("edge1"), profile("edge2", links=radio(-79.0)), profile("edge3"), agreed=agreed),
+    )
+    far = replace(far, voter="robot2")
+    third = replace(near, voter="robot3")
+    joined = compare(SPEC, agreed, {"robot1": near, "robot2": far, "robot3": third}).aggregates
+    alone = compare(SPEC, agreed, {"robot1": near, "robot3": third}).aggregates
+    assert joined["edge2"] == pytest.approx(alone["edge2"] * 2 / 3)
+    assert far.utilities[1].at_limit
 
 
 @pytest.mark.parametrize(
@@ -289,8 +359,7 @@ def test_an_owner_that_the_task_cannot_return_to_asks_for_no_margin(
         replace(profile("edge3"), gauges=(("battery", 0.23),)),
     )
     vector = scored(ROBOT, *edges, spec=spec, agreed=agreed, doubts=Doubts(left=frozenset(left)))
-    (weak,) = (one for one in vector.utilities if one.candidate == "edge2")
-    assert weak.reachable is is_reached
+    assert reached(vector, spec=spec, agreed=agreed)["edge2"] is is_reached
     assert ("edge3" not in dict(vector.refused)) is is_reached
 
 
@@ -302,10 +371,12 @@ def test_a_weak_way_to_the_access_point_that_leads_to_the_owner_too_sets_no_cand
     )
     agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
     spec = replace(SPEC, candidates=("edge1", "edge2", "robot1"))
-    assert [one.reachable for one in scored(weak, *edges, spec=spec, agreed=agreed).utilities[:2]] == [True, True]
+    found = reached(scored(weak, *edges, spec=spec, agreed=agreed), spec=spec, agreed=agreed)
+    assert [found["edge1"], found["edge2"]] == [True, True]
     at_home = replace(agreed, owner="robot1")
     home = replace(weak, workers=(load_of(),))
-    assert [one.reachable for one in scored(home, *edges, spec=spec, agreed=at_home).utilities[:2]] == [False, False]
+    found = reached(scored(home, *edges, spec=spec, agreed=at_home), spec=spec, agreed=at_home)
+    assert [found["edge1"], found["edge2"]] == [False, False]
 
 
 @pytest.mark.parametrize(
