@@ -22,7 +22,7 @@ from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
 from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
-from zsched.core.values.words import told_of_worker
+from zsched.core.values.words import CLOCK_IN_DOUBT, told_of_worker
 
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
@@ -340,6 +340,8 @@ def escape_reason(
     veto = standing.vetoed.get(owner)
     if veto is not None and veto.startswith("reached by"):
         return f"{owner} is {veto}"
+    if veto == CLOCK_IN_DOUBT:  # its exclusive worker has stopped at once
+        return f"{owner}: {veto}"
     return short_of_memory(spec, allocation, profile)
 
 

@@ -172,8 +172,11 @@ class _View:
         self._states, self._now, self._bookings, self._doubts = states, now, bookings, doubts
         owner = allocation.owner
         told = None if owner is None else gateway.fresh(owner, now)
-        has_owner = owner is not None and has_living_owner(
-            spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace
+        may_keep = owner in spec.candidates and owner not in doubts.unfit
+        has_owner = (
+            owner is not None
+            and may_keep
+            and has_living_owner(spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace)
         )
         is_kept = has_owner and owner not in doubts.left and may_return(spec, told)
         of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
@@ -183,7 +186,7 @@ class _View:
             # the way to the access point takes no part in who is better where the owner is reached by it, too
             own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
         self._owner = owner if has_owner else None
-        """Who has the task and works, or may; ``None``: nobody."""
+        """Who has the task, works, or may, and may keep it; ``None``: nobody."""
         self._is_kept = is_kept
         self._of_owner, self._margin_db, self._own_margin_db = of_owner, margin_db, own_margin_db
 

@@ -49,7 +49,10 @@ from zsched.core.values.lease import hold_s
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import CLOCK_IN_DOUBT
 
+_IN_DOUBT = f", {CLOCK_IN_DOUBT}"
+"""Behind the terms of a node's leases."""
 SENT_KEPT = 128
 """Newest numbers whose sending time an owner keeps; an echo of an older one gives no lease."""
 HURRY_S = 0.05
@@ -366,7 +369,7 @@ class Leases:
     @property
     def terms_told(self) -> str:
         """The terms of this node's leases for its beats; in doubt, terms that no other node has."""
-        return f"{self.terms}, clock in doubt" if self.is_in_doubt and self.terms else self.terms
+        return f"{self.terms}{_IN_DOUBT}" if self.is_in_doubt and self.terms else self.terms
 
     def doubt(self, standing: Mapping[TaskId, Allocation | None]) -> None:
         """The clock is in doubt: hold and grant nothing from now on."""
@@ -613,7 +616,9 @@ class Leases:
     def unfit(self) -> dict[NodeId, str]:
         """{node: why it could never hold a valid lease}."""
         return {
-            node: f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"
+            node: CLOCK_IN_DOUBT
+            if terms.endswith(_IN_DOUBT)
+            else f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"
             for node, terms in self._others.items()
         }
 
