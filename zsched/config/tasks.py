@@ -70,7 +70,7 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
         task = _task(name, entry, entry.value, cast, places, out)
         if task is not None:
             tasks.append(task)
-            _advise_network(task.tuning, entry.value, cast, out)
+            _advise_network(task, entry.value, cast, out)
             _advise_deadline(task.tuning, task.worker, entry.value, out)
             _advise_cpu_floor(task, entry.value, out)
             _advise_domain(task.worker, entry.value, out)
@@ -341,13 +341,23 @@ def _advise_gpu_limit(task: TaskSpec, given: Section, out: Collector) -> None:
         out.warn(section.where(gpu.name), message, f"limits: {{gpu: {enough:g}}}, or more")
 
 
-def _advise_network(tuning: Tuning, given: Section, cast: Cast, out: Collector) -> None:
-    if tuning.weights.network > 0 and not any(node.links for node in cast.nodes):
-        weights: Section = given.get("weights")
+def _advise_network(task: TaskSpec, given: Section, cast: Cast, out: Collector) -> None:
+    """Links that the network's weight needs: none at all count nothing, and one that is missing shuts its node out."""
+    if not task.tuning.weights.network > 0:
+        return
+    weights: Section = given.get("weights")
+    hint = "`wifi: wlan0`, `wired: true`, `fixed:` or `trace:`"
+    if not any(node.links for node in cast.nodes):
         message = "the network has a weight, but no node says where its link figure comes from: it will not count"
-        out.warn(
-            weights.where("network"), message, "give the robots `wifi: wlan0`, `wired: true`, `fixed:` or `trace:`"
-        )
+        out.warn(weights.where("network"), message, f"give the robots {hint}")
+        return
+    measured = {node.name for node in cast.nodes if node.links}
+    measured |= {link.peer for node in cast.nodes for link in node.links if link.peer is not None}
+    mute = [name for name in task.candidates if name not in measured]
+    if mute:
+        message = f"the network has a weight, and nobody measures a link of {', '.join(mute)}: beside candidates that "
+        message += "have one, such a node cannot have the task"
+        out.warn(weights.where("network"), message, f"give {mute[0]} {hint}")
 
 
 # --- stream rules ----------------------------------------------------------------------------------------------------

@@ -832,6 +832,26 @@ tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
 
 
 @pytest.mark.parametrize(
+    ("nodes", "mute"),
+    [
+        ("r1: {kind: robot, wifi: wlan0}, e1: {kind: edge, wired: true}, e2: {kind: edge}", "of e2:"),
+        ("r1: {kind: robot, wifi: wlan0}, e1: {kind: edge, wired: true}, e2: {kind: edge, wired: true}", ""),
+        ("r1: {kind: robot, links: {e1: {fixed: -50}, e2: {fixed: -60}}}, e1: {kind: edge}, e2: {kind: edge}", ""),
+    ],
+)
+def test_a_candidate_whose_link_nobody_measures_beside_others_is_a_warning(nodes: str, mute: str) -> None:
+    """It was refused for good, and only `explain` on a running fleet said why."""
+    task = "{candidates: {kind: edge}, weights: {cpu: 0.5, network: 0.5}}"
+    host = 'host: 192.0.2.1, listen: {control: "tcp/0.0.0.0:7457", data: "tcp/0.0.0.0:7458"}, kind: edge'
+    nodes = nodes.replace("e1: {kind: edge", f"e1: {{{host}")
+    result = check(f"fleet: f\nnodes: {{{nodes}}}\ntasks: {{t: {task}}}\n")
+    assert result.fleet is not None, result.report()
+    found = [one.message for one in result.warnings if "nobody measures a link" in one.message]
+    assert len(found) == bool(mute)
+    assert all(mute in message for message in found)
+
+
+@pytest.mark.parametrize(
     ("scheduling", "is_told"),
     [
         ("{score: paper, cpu_floor_ratio: 0.2}", True),

@@ -53,6 +53,10 @@ _NAMES = {
 """{which of Eq. 1-3 are measured: their names}."""
 
 
+UNMEASURED = "{}: not measured there, and it has a weight"
+"""Why a candidate has no worth beside others that have one. Of links that only says what this node measures."""
+
+
 class _Terms(Struct, frozen=True):
     """Eq. 1-3 for one candidate; ``None`` where the metric is not measured. Of the gauges the weighed ones."""
 
@@ -241,6 +245,9 @@ def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utili
     """What each candidate is worth by its terms, and why some have no worth."""
     named = {name: term.names() for name, term in terms.items()}
     measured = frozenset[str]().union(*named.values())
+    weighed = [name for name, weight in tuning.weights.shares if weight > 0.0]
+    # a machine that does not tell its CPU or memory is blind; of links and gauges there may be none
+    are_alike = not {"cpu", "memory", *measured} & {*weighed}
     utilities, refused = [], []
     for candidate, term in terms.items():
         by_gauge = term.gauges
@@ -256,8 +263,11 @@ def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utili
             form=tuning.score,
             gauges=by_gauge,
         )
-        if value is None:
-            refused.append((candidate, "a weighted metric is not measured"))
+        if are_alike:
+            value = 1.0
+        elif value is None:
+            unknown = ", ".join(name for name in weighed if name not in named[candidate] and name not in by_gauge)
+            refused.append((candidate, UNMEASURED.format(unknown)))
             continue
         utilities.append(
             Utility(

@@ -695,7 +695,16 @@ def test_a_metric_missing_for_some_excludes_those() -> None:
     vector = scored(ROBOT, profile("edge1", links=()), *EDGES[1:], agreed=allocation(HALVES))
 
     assert list(values(vector)) == ["edge2", "edge3"]
-    assert vector.refused == (("edge1", "a weighted metric is not measured"),)
+    assert vector.refused == (("edge1", "network: not measured there, and it has a weight"),)
+
+
+@pytest.mark.parametrize("form", list(ScoreForm))
+@pytest.mark.parametrize("weights", [Weights(cpu=0.0, memory=0.0, network=1.0), Weights.of({"gpu": 1.0})])
+def test_where_nobody_measures_what_is_weighed_all_candidates_are_alike(weights: Weights, form: ScoreForm) -> None:
+    """Each was refused, and the task had no owner, by hand neither: what cannot be told apart is no reason for that."""
+    mute = [replace(one, links=()) for one in (ROBOT, *EDGES)]
+    agreed = replace(allocation(weights), tuning=Tuning(weights=weights, score=form))
+    assert values(scored(*mute, agreed=agreed)) == {"edge1": 1.0, "edge2": 1.0, "edge3": 1.0}
 
 
 def test_a_candidate_that_was_refused_does_not_make_a_metric_measured() -> None:
@@ -736,7 +745,7 @@ def test_a_weighed_gauge_is_a_term_like_the_others(form: ScoreForm) -> None:
 
 def test_a_node_without_a_gpu_cannot_have_a_task_that_weighs_it_and_one_without_a_battery_counts_as_full() -> None:
     vector = scored(gauged("edge1", gpu=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.5))
-    assert dict(vector.refused)["edge2"] == "a weighted metric is not measured"
+    assert dict(vector.refused)["edge2"] == "gpu: not measured there, and it has a weight"
 
     vector = scored(gauged("edge1", battery=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, battery=0.5))
     assert terms_of(vector) == {"edge1": {"battery": 0.5}, "edge2": {"battery": 1.0}}
