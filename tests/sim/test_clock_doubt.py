@@ -10,10 +10,12 @@ import pytest
 from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.events import ClockCompared
+from zsched.core.events import ClockCompared, HoldCommanded, MoveCommanded
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.lease import RHO, hold_s
+from zsched.core.values.messages import Hold, HoldTask, MoveTask
+from zsched.core.values.model import Asked, ScoreForm
 from zsched.core.values.plan import WorkerRole
 from zsched.core.values.profile import WorkerState
 from zsched.core.vote.clocks import DOUBT_S, JUMP_S, ClockDoubt
@@ -181,6 +183,41 @@ def test_an_owner_s_worker_stops_at_once_and_the_task_goes_to_a_node_whose_clock
     sim.run(25.0)
     assert "clock" not in sim.node(owner).problems
     assert sim.unsettled() == ""
+
+
+def test_nobody_is_sent_to_a_node_whose_clock_is_in_doubt() -> None:
+    sim, owner = started("edge1", "edge2")
+    (other,) = {"edge1", "edge2"} - {owner}
+    sim.run(5.0)
+    slewed(sim, other, 20.0)
+    sim.run(3.0)
+    order = MoveTask(task="guard", node=other, asked=Asked(by="ada@robot1"))
+    sim.deliver(sim.machines["robot1"], MoveCommanded(request=1, command=order))
+    sim.run(1.0)
+    (answer,) = (one.result for one in sim.answers if one.request == 1)
+    assert answer.detail == f"{other} cannot have it: clock in doubt"
+    assert working(sim) == owner
+
+
+@pytest.mark.parametrize("hold", ["pin", "cool-down", "low battery"])
+def test_nothing_that_waits_for_something_better_keeps_a_task_on_an_owner_whose_clock_is_in_doubt(hold: str) -> None:
+    """It stood still for as long as the doubt lasted: only a planned move left it, and its margins still counted."""
+    of = fleet("edge1", "edge2")
+    tuning = tuning_of(cpu=1.0, memory=0.0, cool_down_s=60.0 if hold == "cool-down" else 2.0, score=ScoreForm.SERVICE)
+    limits = (("battery", 0.2),) if hold == "low battery" else ()
+    task = replace(of.tasks[0], tuning=tuning, gauge_limits=limits)
+    charge = {"edge2": (("battery", 0.22),)} if limits else {}
+    sim = Simulator(fleet=replace(of, tasks=(task,)), seed=1, gauges=lambda node, _now: charge.get(node, ()))
+    sim.start("edge1", *ROBOTS)
+    assert sim.run_until(lambda: working(sim) == "edge1", 20.0)
+    sim.start("edge2")
+    if hold == "pin":
+        order = HoldTask(task="guard", hold=Hold.PIN, node="edge1", asked=Asked(by="ada@robot1"))
+        sim.deliver(sim.machines["robot1"], HoldCommanded(request=1, command=order))
+    sim.run(12.0)
+    assert working(sim) == "edge1"
+    slewed(sim, "edge1", 40.0)
+    assert sim.run_until(lambda: working(sim) == "edge2", 5.0)
 
 
 @pytest.mark.parametrize(("slept_s", "error_s"), [(0.5, 0.0), (3.0, 0.0), (3.0, 0.9), (3.0, -0.9), (60.0, 0.0)])

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.scheduler.scoring import score
+from zsched.core.scheduler.scoring import UNMEASURED, Doubts, score
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, SetHold
@@ -77,9 +77,13 @@ def unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
     if target != node.me and state is not PeerState.ALIVE:
         return f"it is {state}" if state is not PeerState.UNKNOWN else "it was never heard"
     spec = node.fleet.task(value.task).under(value.tuning)
-    vector = score(spec, value, node.me, node.gateway, node.membership.states(), now)
+    # Margins keep the task from what it would leave again by itself; an operator may send it there.
+    left = frozenset() if value.owner is None else frozenset({value.owner})
+    cannot = node.agreement.leases.unfit() if node.executors[value.task].is_leased else {}
+    doubts = Doubts(left=left, unfit=cannot)
+    vector = score(spec, value, node.me, node.gateway, node.membership.states(), now, doubts=doubts)
     refused = dict(vector.refused)
-    if target in refused:
+    if target in refused and (node.rounds.is_voter or refused[target] != UNMEASURED.format("network")):
         return refused[target]
     reach = {utility.candidate: utility.reachable for utility in vector.utilities}
     is_far = node.rounds.is_voter and not reach.get(target, True)

@@ -17,6 +17,7 @@ from support.profiles import SAMPLE, load_of, profile_of
 from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core.handlers.orders import unfit
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.values.change import MoveOwner
@@ -32,10 +33,11 @@ from zsched.core.values.messages import (
     RetryTask,
     TuneTask,
 )
-from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState
-from zsched.core.values.profile import WorkerState
+from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState, ScoreForm
+from zsched.core.values.profile import Link, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import FlagStatus
 from zsched.core.vote.expiry import AGAIN_S
+from zsched_lab.sim.simulator import Simulator
 
 ADA = Asked(by="ada@robot1", reason="new battery")
 EDGES = ("edge1", "edge2", "edge3")
@@ -170,6 +172,44 @@ def test_a_move_to_a_node_that_cannot_have_the_task_is_refused_with_the_reason(
     lone.hear("edge2", state=state, draining=is_draining, number=2)
     result = lone.move("edge2")
     assert (result.outcome, result.detail, lone.value().revision) == (CommandOutcome.INVALID, says, 5)
+
+
+def test_an_operator_may_send_a_task_where_it_would_not_go_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A margin above a limit keeps a task from moving there and back; it was told as "robot1 does not reach it"."""
+    tuning = tuning_of(cpu=0.5, memory=0.2, network=0.3, score=ScoreForm.SERVICE)
+    task = replace(FLEET.tasks[0], tuning=tuning, gauge_limits=(("battery", 0.2),))
+    monkeypatch.setitem(globals(), "FLEET", fleet_of(task, of=(*EDGES, "robot1")))
+    lone = Lone(tuning=tuning)
+    heard = {"edge1": -60.0, "edge2": -78.0, "edge3": -90.0}
+    links = tuple(LinkSample(source=LinkSource.NL80211, peer=name, rssi_dbm=dbm) for name, dbm in heard.items())
+    for number in range(2, 12):
+        lone.wait(0.2)
+        lone.tell(ev.ProfileSampled(device=SAMPLE, links=links))
+        for name in EDGES:
+            lone.hear(name, number=number)
+    assert lone.move("edge3").detail == "edge3 cannot have it: robot1 does not reach it"
+    assert lone.move("edge2").outcome is CommandOutcome.OK
+
+
+def test_a_node_that_does_not_vote_refuses_nobody_for_links_that_it_cannot_measure() -> None:
+    """Robots measure theirs to each candidate; an edge that was asked found the best one without a link."""
+    tuning = tuning_of(cpu=0.5, memory=0.2, network=0.3, score=ScoreForm.SERVICE)
+    candidates = ("edge2", "edge3", "robot1")
+    sim = Simulator(fleet=fleet_of(task_of("merge", candidates, tuning=tuning), of=(*EDGES, "robot1")), seed=1)
+    sim.start()
+    sim.run(5.0)
+    value = replace(allocation_of(5, "edge3", 3), tuning=tuning)
+    told = {}
+    for name in ("edge1", "robot1"):
+        node = sim.node(name)
+        links = tuple(Link(source=LinkSource.NL80211, peer=peer, rssi_dbm=-60.0) for peer in ("edge1", "robot1"))
+        for speaker in sorted({"robot1", "edge3"} - {name}):
+            known = node.gateway.fresh(speaker, sim.now)
+            assert known is not None
+            heard = replace(known, sequence=known.sequence + 1, links=links)
+            assert node.gateway.absorb(heard, sim.now) is None
+        told[name] = unfit(node, value, "edge2", sim.now)
+    assert told == {"edge1": "", "robot1": "network: not measured there, and it has a weight"}
 
 
 def test_a_move_to_a_node_that_is_gone_is_refused() -> None:
