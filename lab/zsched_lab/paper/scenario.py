@@ -318,7 +318,8 @@ def _scenario(path: Path, tree: dict[str, Any]) -> Scenario:
     load, sweep = LoadPlan(**_tuples(tree.pop("load", {}))), Sweep(**_tuples(tree.pop("sweep", {})))
     view = LinkView(tree.pop("link_view", LinkView.ACCESS_POINT))
     rows = {str(name): _block(dict(spec)) for name, spec in dict(tree.pop("blocks", None) or {}).items()}
-    explore = Exploration(**dict(tree.pop("explore", None) or {}))
+    loop = dict(tree.pop("explore", None) or {})
+    explore = Exploration(**{**loop, "first": _tuples(loop.get("first") or {})})
     merge = MergeTask(**dict(tree.pop("merge", None) or {}))
     known = {str(name): value for name, value in _tuples(tree).items()}
     blocks: dict[str, Any] = {"levels": levels, "nodes": nodes, "links": links, "link_view": view, "blocks": rows}

@@ -216,7 +216,7 @@ def test_a_first_drive_is_driven_straight_and_then_it_chooses_by_itself() -> Non
     assert one.step(Pose2(x=1.0), 0.0).speed == 0.0, "not before it has a map"
     one.take_transform(Pose2(x=3.0, y=2.0, yaw=math.pi))  # the frontier is behind it
     one.take_map(grid_of(open_to_the_right()))
-    assert one.way == (pytest.approx((1.0, 2.0)),), "in the merged frame"
+    assert list(one.way[0]) == pytest.approx([1.0, 2.0]), "in the merged frame"
 
     assert one.step(Pose2(x=1.0), 0.0) == Twist(speed=Limits().speed)
     assert (one.claim, one.goals) == (None, 0)
