@@ -25,6 +25,7 @@ from zsched_lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched_lab.decisions.service.replay import Deadline, Player, is_of_task
 from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
+from zsched_lab.paper.schemes import PAPER_BONUS
 
 OWN: Final = ("smoothing_s", "is_told", "tells_jobs", "time_to_trigger_s")
 """Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
@@ -32,13 +33,15 @@ OWN: Final = ("smoothing_s", "is_told", "tells_jobs", "time_to_trigger_s")
 
 
 def players() -> tuple[Player, ...]:
-    """The rules that are always compared."""
+    """The rules that are always compared; the paper's with a cost of 0.1, and two of them with what they have live."""
     return (
         zsched("service"),
         zsched("paper", score=ScoreForm.PAPER),
         _picks("dyna_cpu", CPU_ONLY, PAPER_COST),
         _picks("dyna_mem", MEMORY_ONLY, PAPER_COST),
         _picks("dyna_both", EVEN, PAPER_COST),
+        _picks("dyna_cpu, cost 0.05", CPU_ONLY, PAPER_BONUS),
+        _picks("dyna_both, cost 0.05", EVEN, PAPER_BONUS),
         _picks("dyna_net", RADIO_ONLY, PAPER_COST),
         _picks("argmax", EVEN, 0.0),
     )
