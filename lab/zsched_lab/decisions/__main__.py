@@ -12,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from zsched_lab.decisions import drives, figures, report, study
+from zsched_lab.decisions import drives, figures, halls, report, study
 from zsched_lab.decisions.service import command
 
 PARTS = ("compare", "sweep", "options", "cool-down", "smoothing")
@@ -89,6 +89,9 @@ def main() -> None:
     """Play what is missing, then show everything."""
     if sys.argv[1:2] == ["service"]:
         command.main(sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["halls"]:
+        halls.main(sys.argv[2:])
         return
     given = parse()
     given.out.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ Signals are those recorded at each moment, not their mean: the oracle has the st
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -104,7 +105,9 @@ def cast(world: World) -> tuple[Entry, ...]:
     )
 
 
-def compare(drives: tuple[Drive, ...], *, are_robots: bool) -> tuple[list[DriveFigures], dict[str, list[Move]], World]:
+def compare(
+    drives: tuple[Drive, ...], *, are_robots: bool, cast: Callable[[World], tuple[Entry, ...]] = cast
+) -> tuple[list[DriveFigures], dict[str, list[Move]], World]:
     """Everybody's figures on the drives, the oracle's first; everybody's moves; and the history."""
     world = drives_world(drives, are_robots=are_robots)
     moves = dict(replay(world, cast(world)))
@@ -124,11 +127,12 @@ def _figures(
 ) -> DriveFigures:
     steps = np.flatnonzero(owner >= 0)
     mine = signal[steps, owner[steps]]
+    ways = delay[steps, owner[steps]]
     return DriveFigures(
         rule=rule,
         moves=moves,
         wasted=wasted,
         mean_dbm=float(np.nanmean(mine)),
         weak=float((mine[np.isfinite(mine)] < WEAK_DBM).mean()),
-        delay_ms=float(np.nanmean(delay[steps, owner[steps]])),
+        delay_ms=float(np.nanmean(ways)) if np.isfinite(ways).any() else math.nan,
     )

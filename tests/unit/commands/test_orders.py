@@ -472,22 +472,22 @@ def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemo
 
 def test_a_patience_that_nobody_has_given_goes_along_with_the_weights(daemon: Daemon) -> None:
     """What it is by other weights than the file's is not taken for tuned, neither shown nor asked for."""
-    radio: Json = {**OWN, "weights": {"cpu": 0.5, "memory": 0.3, "network": 0.2}, "patience": 0.3}
+    radio: Json = {**OWN, "weights": {"cpu": 0.5, "memory": 0.3, "network": 0.2}, "patience": 0.4}
     daemon.status["tasks"][0] |= {"tuning": OWN, "file_tuning": OWN}
     result = run("tune", "echo", "memory=0.3", "network=0.2", "--yes")
-    assert ["echo", "patience", "learnt", "0.3"] in [line.split() for line in result.stdout.splitlines()]
+    assert ["echo", "patience", "learnt", "0.4"] in [line.split() for line in result.stdout.splitlines()]
     daemon.status["tasks"][0] |= {"tuning": radio}
     shown = run("tune", "echo").stdout
-    assert ("patience=0.3 " in shown, "patience=0.3 (file" in shown) == (True, False)
-    for words in (["bonus=0.2"], ["patience=null"], ["network=0", "memory=0.5"], ["patience=0.3"]):
+    assert ("patience=0.4 " in shown, "patience=0.4 (file" in shown) == (True, False)
+    for words in (["bonus=0.2"], ["patience=null"], ["network=0", "memory=0.5"], ["patience=0.4"]):
         assert run("tune", "echo", *words, "--yes").exit_code == 0
     assert [order["tuning"].get("patience") for order in daemon.orders] == [None] * 3, "two change nothing"
-    assert run("tune", "echo", "patience=0.3", "network=0", "memory=0.5", "--yes").exit_code == 0
-    assert daemon.orders[-1]["tuning"]["patience"] == 0.3, "by these weights it would be learnt"
+    assert run("tune", "echo", "patience=0.4", "network=0", "memory=0.5", "--yes").exit_code == 0
+    assert daemon.orders[-1]["tuning"]["patience"] == 0.4, "by these weights it would be learnt"
     daemon.status["tasks"][0] |= {"file_tuning": {**OWN, "patience": 0.7}}
-    assert "patience=0.3 (file: 0.7)" in run("tune", "echo").stdout
+    assert "patience=0.4 (file: 0.7)" in run("tune", "echo").stdout
     assert run("tune", "echo", "bonus=0.2", "--yes").exit_code == 0
-    assert daemon.orders[-1]["tuning"]["patience"] == 0.3, "the file gives one, and it was tuned"
+    assert daemon.orders[-1]["tuning"]["patience"] == 0.4, "the file gives one, and it was tuned"
 
 
 def test_signals_that_no_link_could_lie_between_are_refused(daemon: Daemon) -> None:

@@ -267,7 +267,7 @@ def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_
 
 
 def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0033() -> None:
-    assert (PAPER_PATIENCE, RADIO_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S) == (0.55, 0.3, 0.05, 2.0)
+    assert (PAPER_PATIENCE, RADIO_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S) == (0.55, 0.4, 0.05, 2.0)
     assert (DEFAULT_FORESEE_S, Timing().smoothing_s) == (3.0, 0.3)
 
 

@@ -42,8 +42,8 @@ DEFAULT_SCORE = ScoreForm.SERVICE
 """How to score a machine when the fleet file does not say (docs/decisions/0031)."""
 PAPER_PATIENCE = 0.55
 """Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives no patience."""
-RADIO_PATIENCE = 0.3
-"""Patience of a task scored by service that weighs the network. All others learn theirs (docs/decisions/0033)."""
+RADIO_PATIENCE = 0.4
+"""Patience of a task scored by service that weighs the network (docs/decisions/0134). All others learn theirs."""
 DEFAULT_BONUS = 0.05
 """The bonus of a task whose fleet file gives none (docs/decisions/0021)."""
 DEFAULT_COOL_DOWN_S = 2.0
