@@ -296,7 +296,9 @@ def _advise_domain(worker: WorkerSpec, given: Section, out: Collector) -> None:
     ros2, domain = given.get("ros2"), dict(worker.env).get(ROS_DOMAIN)
     if ros2 is None or domain is None or ros2.get("bridge", RosGraph.RMW_ZENOH) is not RosGraph.RMW_ZENOH:
         return
-    if domain != str(ros2.get("domain", 0)):
+    rules = (entry for word in ("inputs", "outputs", "services", "actions") for entry in ros2.get(word, ()))
+    is_node = any({"worker_topic", "worker_service", "worker_action"} & {*entry.places} for entry in rules)
+    if is_node and not (domain.isdecimal() and int(domain) == ros2.get("domain", 0)):
         section: Section = given.get("worker")
         message = (
             f"{ROS_DOMAIN} is {domain} for the worker, and the task's streams are of domain {ros2.get('domain', 0)}"
@@ -342,19 +344,24 @@ def _advise_gpu_limit(task: TaskSpec, given: Section, out: Collector) -> None:
 
 
 def _advise_network(task: TaskSpec, given: Section, cast: Cast, out: Collector) -> None:
-    """Links that the network's weight needs: none at all count nothing, and one that is missing shuts its node out."""
+    """Links that the network's weight needs: none at all count nothing, and one that is missing shuts its node out.
+
+    A candidate's own way, or any node's link to it, is one. A robot that votes alone always reaches itself.
+    """
     if not task.tuning.weights.network > 0:
         return
     weights: Section = given.get("weights")
     hint = "`wifi: wlan0`, `wired: true`, `fixed:` or `trace:`"
-    if not any(node.links for node in cast.nodes):
-        message = "the network has a weight, but no node says where its link figure comes from: it will not count"
-        out.warn(weights.where("network"), message, f"give the robots {hint}")
-        return
-    measured = {node.name for node in cast.nodes if node.links}
+    measured = {node.name for node in cast.nodes if any(link.peer is None for link in node.links)}
     measured |= {link.peer for node in cast.nodes for link in node.links if link.peer is not None}
-    mute = [name for name in task.candidates if name not in measured]
-    if mute:
+    robots = cast.of_kind(NodeKind.ROBOT)
+    mute = [name for name in task.candidates if name not in measured and (name,) != tuple(robots)]
+    if not measured & {*task.candidates}:
+        message = "the network has a weight, but no node says where its link figure comes from: it will not count"
+        if any(node.links for node in cast.nodes):
+            message = "the network has a weight, but nobody measures a link of any candidate: it will not count"
+        out.warn(weights.where("network"), message, f"give robots and candidates {hint}")
+    elif mute:
         message = f"the network has a weight, and nobody measures a link of {', '.join(mute)}: beside candidates that "
         message += "have one, such a node cannot have the task"
         out.warn(weights.where("network"), message, f"give {mute[0]} {hint}")

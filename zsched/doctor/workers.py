@@ -114,7 +114,8 @@ def _packages(task: TaskSpec, user: tuple[int, int] | None) -> Result | None:
         return passed(f"{task.name}: {what} finds what it imports")
     said = f"{done.stderr}\n{done.stdout}".strip().splitlines()
     why = said[-1] if said else f"status {done.returncode}"
-    by = "apt install python3-PACKAGE" if is_debian_package() else f"{python} -m pip install PACKAGE"
+    is_apts = program in PYTHON and is_debian_package()
+    by = "apt install python3-PACKAGE" if is_apts else f"{python} -m pip install PACKAGE"
     fix = (
         f"install what is missing where {task.name} runs: `sudo {by}`, or let `command` begin with a Python that has it"
     )

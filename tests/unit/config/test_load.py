@@ -834,6 +834,8 @@ tasks: {t: {candidates: [r1], weights: {cpu: 0.5, network: 0.5}}}
 @pytest.mark.parametrize(
     ("nodes", "mute"),
     [
+        ("r1: {kind: robot, wifi: wlan0}, e1: {kind: edge}", "of any candidate"),
+        ("r1: {kind: robot, wifi: wlan0}, e1: {kind: edge, wired: true}", ""),
         ("r1: {kind: robot, wifi: wlan0}, e1: {kind: edge, wired: true}, e2: {kind: edge}", "of e2:"),
         ("r1: {kind: robot, wifi: wlan0}, e1: {kind: edge, wired: true}, e2: {kind: edge, wired: true}", ""),
         ("r1: {kind: robot, links: {e1: {fixed: -50}, e2: {fixed: -60}}}, e1: {kind: edge}, e2: {kind: edge}", ""),

@@ -275,9 +275,11 @@ def test_type_hashes_in_the_shipped_files_are_what_rosbags_computes() -> None:
         ("bridge: rmw_zenoh", '{ROS_DOMAIN_ID: "7"}', True),
         ("bridge: ros2dds", '{ROS_DOMAIN_ID: "7"}', False),
         ("domain: 7", "{}", False),
+        ("domain: 7", '{ROS_DOMAIN_ID: "07"}', False),
     ],
 )
 def test_a_worker_of_another_domain_than_its_streams_is_a_warning(domain: str, env: str, *, is_told: bool) -> None:
-    rules = f"worker: {{command: [x], env: {env}}}\n    ros2: {{{domain}}}"
+    entry = "{topic: /map, type: nav_msgs/msg/OccupancyGrid, worker_topic: '/{target}/map/{robot}'}"
+    rules = f"worker: {{command: [x], env: {env}}}\n    ros2: {{{domain}, inputs: [{entry}]}}"
     found = [one for one in check(rules).warnings if "ROS_DOMAIN_ID is 7" in one.message]
     assert [one.line for one in found] == [FILE.splitlines().index("    RULES") + 1] * is_told
