@@ -152,8 +152,8 @@ class Demands:
             known = _came(known, profile.node, now)
             self._spending.pop(task, None)
         found = replace(known, seen_s=now)
-        if profile.cpu_used_cores is None:  # it is there, and shows by its memory all the same
-            self._known[task] = found
+        if profile.cpu_used_cores is None:  # it is there, and shows by its memory, and says nothing of its need
+            self._known[task] = known
             return False
         if is_full(profile):
             found = replace(found, full_at=now)
