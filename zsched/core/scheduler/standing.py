@@ -50,7 +50,7 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
     told = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
     needed = len(told) if spec.reach is Reach.ALL else majority(len(told))
     fresh = told
-    if allocation.owner is not None and _reaching(allocation.owner, told) >= needed:
+    if allocation.owner is not None and len(told) - _losing(allocation.owner, told) >= needed:
         fresh = tuple(_with_margin(vector, allocation.owner) for vector in told)
     columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
     reasons: dict[NodeId, str] = {}
@@ -85,6 +85,11 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
 def _reaching(candidate: NodeId, vectors: tuple[UtilityVector, ...]) -> int:
     """By how many robots a candidate is reached, at the limit of its signal, too."""
     return sum(any(one.candidate == candidate and one.reachable for one in vector.utilities) for vector in vectors)
+
+
+def _losing(owner: NodeId, vectors: tuple[UtilityVector, ...]) -> int:
+    """How many robots do not reach the owner; one that they refuse for something else is not lost by that."""
+    return sum(any(one.candidate == owner and not one.reachable for one in vector.utilities) for vector in vectors)
 
 
 def _with_margin(vector: UtilityVector, owner: NodeId) -> UtilityVector:

@@ -323,6 +323,16 @@ def test_the_margin_hangs_on_whether_the_robots_reach_the_owner_and_not_on_one_o
     assert standing.vetoed.get("edge2", "") == why
 
 
+def test_an_owner_that_is_refused_is_not_lost_by_that_to_the_radio() -> None:
+    """A gap of its profiles made a machine at the limit of its signal a place to go, and come back from."""
+    agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
+    edges = (replace(profile("edge1"), gauges=(("battery", 0.1),)), profile("edge2", links=radio(-79.0)))
+    vector = scored(ROBOT, *edges, spec=spec, agreed=agreed)
+    assert dict(vector.refused).keys() >= {"edge1"}
+    assert not reached(vector, spec=spec, agreed=agreed)["edge2"]
+
+
 def test_a_candidate_at_the_limit_counts_nothing_for_who_hears_it_so_while_the_owner_is_reached() -> None:
     agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
     near, far = (
