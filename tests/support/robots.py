@@ -32,7 +32,8 @@ class Decider:
         """Time has passed."""
         todo = ToDo()
         for proposal in self.rounds.tick(values, states, todo, now):
-            self.votes.propose(proposal, values[proposal.task], states, todo, now)
+            takes_turns = self.rounds.tasks[proposal.task].takes_turns
+            self.votes.propose(proposal, values[proposal.task], states, todo, now, takes_turns=takes_turns)
         self.votes.count(values, states, todo, now)
         return self._settled(todo, now)
 

@@ -64,7 +64,8 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
         elif tuning.weights.cpu > 0.0:
             yield "what programs that are no tasks would still get there does not count (cpu_floor_ratio: 0)"
     else:
-        yield f"an owner with less than {floor} of its memory free is left at once (memory_floor_ratio)"
+        less = "and a machine that would have less gets nothing while another one has more"
+        yield f"an owner with less than {floor} of its memory free is left at once, {less} (memory_floor_ratio)"
     for name, limit in spec.gauge_limits:
         gauge = BY_NAME[name]
         side, unknown = ("below" if gauge.is_floor else "above"), ("refused" if gauge.is_needed else "taken")

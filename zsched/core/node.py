@@ -191,7 +191,8 @@ class Node(Stages):
         if not self.rounds.is_idle(now):
             values, states = self.values(), self.membership.states()
             for proposal in self.rounds.tick(values, states, todo, now):
-                self.votes.propose(proposal, values[proposal.task], states, todo, now)
+                takes_turns = self.rounds.tasks[proposal.task].takes_turns
+                self.votes.propose(proposal, values[proposal.task], states, todo, now, takes_turns=takes_turns)
 
     def _agree(self, todo: ToDo, now: float) -> None:
         if not self.votes.is_idle:

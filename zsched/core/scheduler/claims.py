@@ -3,9 +3,9 @@
 Knows: where tasks go whose votes are open or won at this robot, and what memory they will need there. Does not know:
 who is better, whether a task has another place (`zsched.core.scheduler.decision`).
 
-Tasks that lose their owner together are judged in one round, for no escape waits for another one. Each by itself they
-would all find the same machine free, go there together, and some would leave it again for want of memory. Every robot
-judges them in the order of their names, and so comes to the same claims.
+Tasks that lose their owner together are judged in one round, for such an escape waits for no other one. Each by itself
+they would all find the same machine free, go there together, and some would leave it again for want of memory. Every
+robot judges them in the order of their names, and so comes to the same claims.
 """
 
 from __future__ import annotations

@@ -35,8 +35,10 @@ class Decided(Struct, frozen=True, kw_only=True):
     spent: float
     """What staying has cost by now, of the patience."""
     patience: float
+    takes_turns: bool = False
+    """It waits for other tasks' moves: a planned one, or a flight from short memory."""
     is_waiting_its_turn: bool = False
-    """A planned move that another task's move holds back."""
+    """Another task's move holds it back."""
 
 
 def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
@@ -51,21 +53,23 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
     standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
     standing = _leave_to_others(standing, figures)
+    out = set(figures.out)
     is_short = escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile)
     if allocation.tuning.score is ScoreForm.PAPER:
         roomy = _with_room(standing, figures)
         has_other = bool(roomy.aggregates.keys() - {allocation.owner})
-        may_stay = escape is None and allocation.owner in roomy.aggregates
+        may_stay = escape is None and not figures.drained and allocation.owner in roomy.aggregates
         if is_short and not has_other:
             escape, is_short = None, False  # where all are short of memory, to flee would only be to come back
         elif is_short or (not allocation.is_bound and (has_other or may_stay)):
+            out |= standing.aggregates.keys() - roomy.aggregates.keys()
             standing = roomy
     needed = _robots_needed(figures, is_escape=escape is not None)
     if standing.voters_heard < needed:
         reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
         judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
     else:
-        judge.out = frozenset(figures.out)
+        judge.out = frozenset(out)
         judgement = judge.judge(
             standing,
             allocation,
@@ -80,8 +84,8 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
     if escape is None:
         judgement = _look_ahead(judge, judgement, standing, figures)
     # two tasks that flee from one machine for its memory would both find room on another, and both flee from there
-    can_wait = judgement.outcome is Outcome.PROPOSE and (not judgement.is_escape or is_short)
-    is_waiting = can_wait and figures.first is not None
+    takes_turns = judgement.outcome is Outcome.PROPOSE and (not judgement.is_escape or is_short)
+    is_waiting = takes_turns and figures.first is not None
     if is_waiting:
         # the figures are read again before it is judged once more
         judgement = _put_off(judgement, allocation, f"{figures.first} moves first")
@@ -95,6 +99,7 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
         needed=needed,
         spent=judge.spent,
         patience=judge.patience,
+        takes_turns=takes_turns,
         is_waiting_its_turn=is_waiting,
     )
 

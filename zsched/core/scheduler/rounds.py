@@ -75,6 +75,8 @@ class TaskRound:
     judged_at: float = -math.inf
     silent: tuple[NodeId, ...] = ()
     damping: Damping = field(default_factory=Damping)
+    takes_turns: bool = False
+    """Whether what was last judged waits for other tasks' moves."""
     is_waiting_its_turn: bool = False
     told: str = ""
     """The last decision written to the journal; the same one again is not."""
@@ -337,6 +339,7 @@ class Rounds:
         judgement = decided.judgement
         task.standing, task.judgement, task.judged_at = decided.standing, judgement, now
         task.figures, task.is_waiting_its_turn = figures, decided.is_waiting_its_turn
+        task.takes_turns = decided.takes_turns
         self._tell(task, judgement, allocation, todo)
         if self._turns[task.spec.name].commit is not None:
             return None

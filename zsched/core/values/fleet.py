@@ -246,7 +246,8 @@ class TaskSpec:
     memory_floor_ratio: float = key(
         0.05,
         "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
-        "(`score: paper`: an owner that has less is left).",
+        "(`score: paper`: an owner that has less is left, and a machine that would have less gets nothing while "
+        "another one would not).",
         Range(0, MAX_FLOOR),
     )
     cpu_floor_ratio: float = key(

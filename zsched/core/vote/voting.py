@@ -65,7 +65,7 @@ class Voting:
         return self.commit_at if self.opened_at is None else min(self.commit_at, self.opened_at + self._vote_s)
 
     def call(self, now: float) -> None:
-        """This robot proposes a planned move.
+        """This robot proposes a move that takes turns.
 
         The first try on a value keeps the task's turn: an owner that is asked to leave and slow to stop leaves by the
         next vote, if that comes before its lease is granted again.
@@ -208,10 +208,17 @@ class Votes:
         return all(voting.opened_at is None for voting in self.tasks.values())
 
     def propose(
-        self, proposal: Proposal, allocation: Allocation, states: Mapping[NodeId, PeerState], todo: ToDo, now: float
+        self,
+        proposal: Proposal,
+        allocation: Allocation,
+        states: Mapping[NodeId, PeerState],
+        todo: ToDo,
+        now: float,
+        *,
+        takes_turns: bool,
     ) -> None:
-        """This robot's own proposal: send it to everybody, and count it here."""
-        if not proposal.is_escape:
+        """This robot's own proposal: send it to everybody, and count it here. ``takes_turns``: it costs one."""
+        if takes_turns:
             self.tasks[proposal.task].call(now)
         todo.add(PublishProposal(proposal=proposal))
         self.absorb(proposal, allocation, states, todo, now)

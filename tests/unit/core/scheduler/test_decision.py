@@ -19,7 +19,7 @@ from support.profiles import load_of, profile_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Figures
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
-from zsched.core.values.model import NodeId, ScoreForm, TaskId, Utility, UtilityVector
+from zsched.core.values.model import NodeId, PeerState, ScoreForm, TaskId, Utility, UtilityVector
 from zsched.core.values.profile import WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
@@ -188,8 +188,24 @@ def test_nothing_better_is_on_a_machine_that_would_be_left_for_its_memory_at_onc
     assert decided.standing.vetoed == {"edge2": "would have 4 % of its memory free"}
     alone = replace(roomy, vectors=full(has_room=False).vectors)
     assert set(decide_again(alone).standing.aggregates) == {"edge1"}, "the owner stays, though edge2 is worth more"
+    drained = replace(alone, drained="drained by ada@robot1")
+    assert decide_again(drained).judgement.candidate == "edge2", "a machine that is drained is left all the same"
     homeless = replace(alone, allocation=replace(alone.allocation, owner=None), owner_profile=None)
     assert decide_again(homeless).standing.vetoed == {}, "any place is better than none"
+    one_is_roomy = replace(homeless, vectors=full(has_room=True).vectors)
+    assert decide_again(one_is_roomy).judgement.reason.startswith("first placement: "), (
+        "it waits for none of the others"
+    )
+
+
+@pytest.mark.parametrize("is_gone", [True, False])
+def test_a_flight_from_short_memory_takes_its_turn_and_no_other_one_does(*, is_gone: bool) -> None:
+    """Else the lower name would always go first, and the other task stay on the short machine for good."""
+    figures = full(has_room=True)
+    figures = replace(figures, owner_state=PeerState.GONE if is_gone else figures.owner_state)
+    decided = decide_again(replace(figures, first="watch"))
+    assert decided.is_waiting_its_turn is decided.takes_turns is not is_gone
+    assert decided.judgement.reason.endswith("watch moves first") is not is_gone
 
 
 def test_of_two_tasks_that_are_short_of_memory_on_one_machine_one_leaves() -> None:
