@@ -81,7 +81,16 @@ def options(tmp_path: Path, name: str, **given: Any) -> BenchOptions:
 
 
 def test_the_shipped_scenarios_are_found_by_name_and_nothing_else_is() -> None:
-    assert shipped_names() == ("heavy-again", "heavy-all", "heavy-oracle", "nano", "nano-again", "nano-moves", "paper")
+    assert shipped_names() == (
+        "heavy-again",
+        "heavy-all",
+        "heavy-calm",
+        "heavy-oracle",
+        "nano",
+        "nano-again",
+        "nano-moves",
+        "paper",
+    )
     assert shipped_scenario("paper") == scenario_path()
     assert shipped_scenario("nono") is None
     assert shipped_scenario("../paper") is None
@@ -104,7 +113,7 @@ def test_nano_has_the_authors_demands_in_their_proportions() -> None:
     assert sorted(loop.slam_on.values()) == sorted(scenario.nodes)
 
 
-@pytest.mark.parametrize("name", ["nano", "nano-moves"])
+@pytest.mark.parametrize("name", ["nano", "nano-again", "nano-moves"])
 def test_every_program_s_demand_is_the_authors_and_its_worker_goes_to_the_tasks_group(name: str) -> None:
     scenario = shipped(name)
     fleet = load_fleet(scenario.fleet)
@@ -123,6 +132,7 @@ def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
         "heavy-again": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"), 8),
         "heavy-oracle": (("dyna_both", "zsched", "oracle"), 8),
         "heavy-all": ((*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched", "oracle"), 5),
+        "heavy-calm": ((*FIXED_SCHEMES, "dyna_cpu", "dyna_both", "zsched", "oracle"), 4),
     }
     limits, seeds = set(), set(range(20260, 20260 + 100))
     for name, (schemes, runs) in wanted.items():
@@ -146,7 +156,7 @@ def test_every_second_run_takes_the_schemes_in_reverse() -> None:
     assert abs(order[0].index("zsched") - order[0].index("dyna_both")) == 1
 
 
-@pytest.mark.parametrize("name", ["heavy-again", "heavy-oracle", "heavy-all"])
+@pytest.mark.parametrize("name", ["heavy-again", "heavy-oracle", "heavy-all", "heavy-calm"])
 def test_heavy_again_is_heavy(name: str) -> None:
     paper, again = load_scenario(scenario_path()), shipped(name)
     heavy = paper.blocks["heavy"]
@@ -264,7 +274,8 @@ def test_nano_s_robots_are_led_by_slam_and_navigation_on_their_edges(tmp_path: P
 def test_nano_again_is_nano_whose_robots_first_drive_is_given(tmp_path: Path) -> None:
     nano, again = shipped("nano"), shipped("nano-again")
     assert again.explore == replace(nano.explore, first=dict.fromkeys(("robot1", "robot2", "robot3"), (3, 0)))
-    assert (again.fleet, again.merge, again.nodes, again.load) == (nano.fleet, nano.merge, nano.nodes, nano.load)
+    assert (again.merge, again.load) == (nano.merge, nano.load)
+    assert {share.cpu_cores for share in again.nodes.values()} == {shipped("nano-moves").full_cores}
     assert (again.level, again.levels, again.links) == (nano.level, nano.levels, nano.links)
     endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
 
