@@ -179,9 +179,14 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     if quorum.ok and not voters:
         problems.append("nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one")
     elif quorum.ok and len(voters) - len(silent) < needed:
+        replaced = (
+            f" An owner that is gone, stops or fails is still replaced{never_heard}"
+            if len(silent) < len(voters)
+            else ""
+        )
         problems.append(
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
-            f"not {told}. An owner that is gone, drains or fails is still replaced{never_heard}"
+            f"not {told}.{replaced or ' No owner is replaced'}"
         )
     if not has_enough and not node.has_others_state:
         problems.append(_nothing_agreed(node, quorum, fresh))

@@ -559,13 +559,21 @@ def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -
     (problem,) = build_snapshot(node, 100.0).problems
     assert problem == (
         "no planned moves: 1 of 3 robots can vote, 2 needed; not robot2 (not heard yet), robot3 (not heard "
-        "yet). An owner that is gone, drains or fails is still replaced"
+        "yet). An owner that is gone, stops or fails is still replaced"
     )
     with patch.object(Agreement, "document_hash", "0d"):
         (problem,) = build_snapshot(node, 100.0).problems
     assert problem.endswith("is still replaced; one that was never heard, once they are away for 60 s")
     node.handle(ev.BeatReceived(beat=beat_of("robot2", incarnation=3)), 100.0)
     assert build_snapshot(node, 100.0).problems == ()
+
+
+def test_where_no_robot_can_vote_nobody_is_said_to_be_replaced() -> None:
+    edges = fleet_of(*FLEET.tasks, of=(*EDGES, *ROBOTS), electors=EDGES[:1])
+    node = make("edge1", alive=(), fleet=edges)
+    (problem,) = (one for one in build_snapshot(node, 100.0).problems if "can vote" in one)
+    assert problem.startswith("no planned moves: 0 of 3 robots can vote, 2 needed")
+    assert problem.endswith("No owner is replaced")
 
 
 def test_a_fleet_without_robots_says_that_nobody_votes() -> None:
