@@ -26,7 +26,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     # pattern of the module's name below "zsched.", floor, room (\1: the group)
     (r"(__init__|_version)", 0, "version"),
     (r"core(\..+)?", 1, "core"),
-    (r"(clock|errors|exits|files|guard|heap|latch|log_limit|paths|procfs|screen)", 2, "common"),
+    (r"(clock|errors|exits|files|guard|heap|installer|latch|log_limit|paths|procfs|screen)", 2, "common"),
     (r"(config|hop|sessions|wire)(?:\..+)?", 3, "\\1"),
     (r"ipc(\..+)?", 4, "ipc"),
     (r"adapters\.(\w+)(?:\..+)?", 5, "adapters: \\1"),
