@@ -100,6 +100,11 @@ def authority_folder(given: Path | None, env: Mapping[str, str], fleet: str) -> 
     return _authorities(env) / fleet
 
 
+def has_authority(folder: Path) -> bool:
+    """Whether an authority lies there."""
+    return (folder / AUTHORITY_RECORD).exists()
+
+
 def authority_folders(env: Mapping[str, str]) -> list[Path]:
     """All that lie below the user's own data, of whatever fleet."""
     return [record.parent for record in sorted(_authorities(env).glob(f"*/{AUTHORITY_RECORD}"))]

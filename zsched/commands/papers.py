@@ -20,13 +20,12 @@ from zsched.commands.common import CliError, check_dangers, check_name, warn
 from zsched.commands.pki import (
     begin_for,
     former_keys,
-    holds_authority,
     is_left_of,
     issue_for,
     passphrase_for,
     supersede,
 )
-from zsched.commands.renewing import renew_advice
+from zsched.commands.renewing import holds_authority, renew_advice
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError

@@ -31,7 +31,7 @@ from zsched.commands.common import (
     say,
     warn,
 )
-from zsched.commands.renewing import renew_advice
+from zsched.commands.renewing import holds_authority, renew_advice
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
 from zsched.core.values.fleet import Fleet
@@ -83,7 +83,7 @@ def init(where: Where, *, asks_passphrase: bool, accepted: Sequence[str] = ()) -
 
     check_dangers(accepted, DANGERS)
     office = _office(where)
-    if (trusted := _trusted_here(office.fleet)) and SECOND not in accepted and not _has_record(office.folder):
+    if (trusted := _trusted_here(office.fleet)) and SECOND not in accepted and not places.has_authority(office.folder):
         advice = f"if that is lost for good (docs/guide/secure.md): --accept {SECOND}"
         said = f"a second authority makes certificates by which nobody is let in; {advice}"
         raise CliError(EXIT_FAILED, f"{_elsewhere(office.fleet, trusted)}; {said}")
@@ -148,12 +148,6 @@ def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: b
     authority = create(folder, fleet.name, secret, _now(), creation)
     issued = authority.issue(node, Role.NODE, _check_name(fleet, node, Role.NODE), b"", secret, _now())
     return Begun(authority=authority, issued=issued, is_locked=bool(secret))
-
-
-def holds_authority(fleet: str, given: Path | None) -> Path | None:
-    """The folder of a fleet's authority on this machine; ``None``: there is none."""
-    folder = places.authority_folder(given, os.environ, fleet)
-    return folder if _has_record(folder) else None
 
 
 class Known(Struct, frozen=True, kw_only=True):
@@ -540,15 +534,10 @@ def _opened(where: Where) -> Iterator[tuple[_Office, Authority]]:
     from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
 
     office = _office(where)
-    if (trusted := _trusted_here(office.fleet)) and not _has_record(office.folder):
+    if (trusted := _trusted_here(office.fleet)) and not places.has_authority(office.folder):
         raise AdapterError(f"there is no authority in {office.folder}; {_elsewhere(office.fleet, trusted)}")
     with opened(office.folder, office.fleet.name) as authority:
         yield office, authority
-
-
-def _has_record(folder: Path) -> bool:
-    """Whether an authority lies there."""
-    return (folder / places.AUTHORITY_RECORD).exists()
 
 
 def _trusted_here(fleet: Fleet) -> Path | None:

@@ -16,7 +16,7 @@ from typing import Final
 from zsched.config.load import check_bytes
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.files import read_regular
-from zsched.paths import AUTHORITY_RECORD, authority_folder
+from zsched.paths import AUTHORITY_RECORD, authority_folder, has_authority
 
 TIMER: Final = "zsched-renew.timer"
 UNIT_FOLDER: Final = Path("/root/.local/share/zsched/authority")
@@ -28,6 +28,12 @@ HOLDS_AUTHORITY: Final = "holds-authority"
 MAX_RECORD: Final = 4 << 20
 
 
+def holds_authority(fleet: str, given: Path | None) -> Path | None:
+    """The folder of a fleet's authority on this machine; ``None``: there is none."""
+    folder = authority_folder(given, os.environ, fleet)
+    return folder if has_authority(folder) else None
+
+
 def authority_here(fleet: str, config: Path, text: str = "") -> Path | None:
     """The folder of the authority on this machine by which a fleet's certificates are renewed; ``None``: there is none.
 
@@ -36,12 +42,11 @@ def authority_here(fleet: str, config: Path, text: str = "") -> Path | None:
         config: its fleet file here, which counts where there is no ``text``.
         text: its document.
     """
-    folder = authority_folder(None, os.environ, fleet)
     try:
-        is_here = (folder / AUTHORITY_RECORD).exists()
+        folder = holds_authority(fleet, None)
     except PermissionError:  # who may not look into it renews nothing by it
-        is_here = False
-    if not is_here or not _is_secured(text, config) or _named(folder) not in (fleet, None):
+        folder = None
+    if folder is None or not _is_secured(text, config) or _named(folder) not in (fleet, None):
         return None
     return folder
 

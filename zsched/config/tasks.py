@@ -14,6 +14,7 @@ from zsched.config.nodes import Cast, select
 from zsched.config.reader import Collector, Place, nearest
 from zsched.config.ros2 import ros2_rules
 from zsched.config.rulecheck import RuleConflict, rule_conflicts
+from zsched.core.route.ros2 import DOMAIN
 from zsched.core.route.route import NOBODY, PLACEHOLDERS, named_rules, placeholders
 from zsched.core.route.templates import merges_keys, rule_fault, shared_key_fault, template_fault
 from zsched.core.scheduler.patience import FIRST_PATIENCE
@@ -48,7 +49,6 @@ from zsched.core.values.plan import (
 )
 from zsched.core.values.words import PAPER_METRICS
 
-ROS_DOMAIN: Final = "ROS_DOMAIN_ID"
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
 _ANY_CANDIDATES: Final = (NOBODY,)
@@ -293,19 +293,15 @@ def _advise_cpu_floor(task: TaskSpec, given: Section, out: Collector) -> None:
 
 def _advise_domain(worker: WorkerSpec, given: Section, out: Collector) -> None:
     """The worker's nodes and the rules' keys belong to two domains: nothing that one puts reaches the other."""
-    ros2, domain = given.get("ros2"), dict(worker.env).get(ROS_DOMAIN)
+    ros2, domain = given.get("ros2"), dict(worker.env).get(DOMAIN)
     if ros2 is None or domain is None or ros2.get("bridge", RosGraph.RMW_ZENOH) is not RosGraph.RMW_ZENOH:
         return
     rules = (entry for word in ("inputs", "outputs", "services", "actions") for entry in ros2.get(word, ()))
     is_node = any({"worker_topic", "worker_service", "worker_action"} & {*entry.places} for entry in rules)
     if is_node and not (domain.isdecimal() and int(domain) == ros2.get("domain", 0)):
         section: Section = given.get("worker")
-        message = (
-            f"{ROS_DOMAIN} is {domain} for the worker, and the task's streams are of domain {ros2.get('domain', 0)}"
-        )
-        out.warn(
-            section.get("env")[ROS_DOMAIN].place, message, f"ros2: {{domain: {domain}}}, or {ROS_DOMAIN}: of that one"
-        )
+        message = f"{DOMAIN} is {domain} for the worker, and the task's streams are of domain {ros2.get('domain', 0)}"
+        out.warn(section.get("env")[DOMAIN].place, message, f"ros2: {{domain: {domain}}}, or {DOMAIN}: of that one")
 
 
 def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:

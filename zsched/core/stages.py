@@ -332,9 +332,13 @@ class Stages:
                 if profile is not None:
                     yield name, profile
 
+    def unfit(self, task: TaskId) -> Mapping[NodeId, str]:
+        """{node: why it can hold no lease} of an exclusive task; of any other one nobody needs any."""
+        return self.agreement.leases.unfit() if self.executors[task].is_leased else {}
+
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
-        unfit = self.agreement.leases.unfit() if self.executors[spec.name].is_leased else {}
+        unfit = self.unfit(spec.name)
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)

@@ -21,6 +21,7 @@ from zsched.doctor.model import (
     Scene,
     counted,
     failed,
+    goes_by_other_electors,
     joined,
     passed,
     skipped,
@@ -73,8 +74,7 @@ def have_one_file(scene: Scene) -> Result:
     told = [f"{name} goes by hash {found}, {scene.source} here has {mine}" for name, found in apart.items()]
     if scene.document is not None:
         return failed(*told, fix="zsched fleet show names the revision of each node, and why it does not follow")
-    electors = sorted(scene.fleet.electors)
-    if any(sorted(scene.statuses[name]["quorum"]["names"]) != electors for name in apart):
+    if any(goes_by_other_electors(scene, scene.statuses[name]) for name in apart):
         return failed(*told, fix=OTHER_ELECTORS)
     fix = (
         "copy the one file to all machines, and `sudo systemctl reload zsched` on each; zsched status names what waits"

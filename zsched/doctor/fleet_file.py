@@ -7,7 +7,17 @@ from __future__ import annotations
 
 from zsched.config.reader import Fault
 from zsched.core.values.fleet import fleet_hash
-from zsched.doctor.model import OTHER_ELECTORS, Result, Scene, counted, failed, passed, skipped, warned
+from zsched.doctor.model import (
+    OTHER_ELECTORS,
+    Result,
+    Scene,
+    counted,
+    failed,
+    goes_by_other_electors,
+    passed,
+    skipped,
+    warned,
+)
 
 
 def valid(scene: Scene) -> Result:
@@ -58,12 +68,11 @@ def in_force(scene: Scene) -> Result:
     mine, running = fleet_hash(scene.fleet), str(scene.status["fleet_file"])
     if mine == running:
         return passed(f"the daemon goes by this file, hash {mine}")
-    is_same = sorted(scene.status["quorum"]["names"]) == sorted(scene.fleet.electors)
     return warned(
         f"the daemon goes by a file of hash {running}, {scene.file} has {mine}",
-        fix="sudo systemctl reload zsched; zsched status then names what waits for a restart"
-        if is_same
-        else OTHER_ELECTORS,
+        fix=OTHER_ELECTORS
+        if goes_by_other_electors(scene, scene.status)
+        else "sudo systemctl reload zsched; zsched status then names what waits for a restart",
     )
 
 

@@ -182,6 +182,11 @@ class Scene(Struct, frozen=True, kw_only=True):
         return self.root / str(path).lstrip("/")
 
 
+def goes_by_other_electors(scene: Scene, status: Json) -> bool:
+    """Whether the node that answered ``status`` has other electors in force than the fleet file here names."""
+    return sorted(status["quorum"]["names"]) != sorted(scene.fleet.electors)
+
+
 class Check(Struct, frozen=True, kw_only=True):
     """One question about this machine or its fleet. ``name`` is ``family.word`` and never changes its meaning."""
 

@@ -33,6 +33,7 @@ from zsched.core.route.lifecycle import (
     step,
 )
 from zsched.core.route.ros2 import (
+    DOMAIN,
     GID_BYTES,
     MAX_DOMAIN,
     Attachment,
@@ -61,7 +62,6 @@ SILENT_S: Final = 10.0
 """A node that has answered once, and then does not for this long, has failed."""
 CHANGE_S: Final = {Transition.CONFIGURE: 60.0, Transition.ACTIVATE: 10.0, Transition.DEACTIVATE: 3.0}
 """A node may take this long to change: one that is no owner any more, and stays active, is killed soon."""
-DOMAIN: Final = "ROS_DOMAIN_ID"
 
 
 class LifecycleNode:

@@ -23,6 +23,7 @@ from zsched.core.values.model import ScoreForm
 from zsched_lab.decisions import entries, radio
 from zsched_lab.decisions.drives import UNSMOOTHED, compare
 from zsched_lab.decisions.replay import Entry
+from zsched_lab.decisions.report import mean_and_spread
 from zsched_lab.decisions.rules import PickRule
 from zsched_lab.decisions.world import DT_S, World
 
@@ -86,10 +87,11 @@ def rows(seeds: Sequence[int], *, are_robots: bool) -> Iterator[Row]:
             played.setdefault(one.rule, []).append((oracle.mean_dbm - one.mean_dbm, one.moves, one.wasted))
     for rule, found in played.items():
         under, moves, wasted = zip(*found, strict=True)
+        under_db, error_db = mean_and_spread(under)
         yield Row(
             rule=rule,
-            under_db=statistics.fmean(under),
-            error_db=1.96 * statistics.stdev(under) / len(under) ** 0.5,
+            under_db=under_db,
+            error_db=error_db,
             moves=statistics.fmean(moves),
             wasted_ratio=sum(wasted) / max(sum(moves), 1),
         )

@@ -51,14 +51,12 @@ def avoid_s(limits: Limits) -> float:
     return max(AVOID_S, AVOID_M / limits.speed)
 
 
-def first_of(start: Pose2, offset: Point | None) -> Point | None:
+def first_of(start: Pose2, offset: Point) -> Point:
     """Where a robot at ``start`` drives first, in its map frame: ``offset`` away in the world's directions.
 
     >>> first_of(Pose2(x=4.0, yaw=math.pi), (3.0, 0.0))
     (-3.0, 0.0)
     """
-    if offset is None:
-        return None
     x, y = start.inverse().apply_point(start.x + offset[0], start.y + offset[1])
     return round(x, 3), round(y, 3) + 0.0
 

@@ -113,6 +113,7 @@ def _robots(plan: LedRun) -> dict[str, _Robot]:
     found = {}
     for index, start in enumerate(plan.world.starts(plan.robots)):
         name = f"robot{index + 1}"
+        first = first_of(start, plan.first[name]) if name in plan.first else None
         settings = RobotSettings(
             robot=name,
             start=start,
@@ -126,7 +127,7 @@ def _robots(plan: LedRun) -> dict[str, _Robot]:
         found[name] = _Robot(
             agent=Agent(settings, plan.world, phase=index / plan.robots),
             slam=Slam(SlamSettings(robot=name, map_period_s=plan.map_period_s)),
-            navigation=Explorer(name, plan.limits, avoid_s(plan.limits), first_of(start, plan.first.get(name))),
+            navigation=Explorer(name, plan.limits, avoid_s(plan.limits), first),
         )
     return found
 

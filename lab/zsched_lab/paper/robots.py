@@ -182,12 +182,11 @@ class ExploreRobots:
 
     def _firsts(self) -> Mapping[NodeId, list[str]]:
         """{robot: navigation's arguments for where it drives first}."""
-        starts = load_world(self.world).starts(len(self.slam_on))
-        goals = {
-            robot: first_of(start, self.first.get(robot))
-            for robot, start in zip(sorted(self.slam_on), starts, strict=True)
-        }
-        return {robot: ["--first", f"{goal[0]:g}", f"{goal[1]:g}"] for robot, goal in goals.items() if goal is not None}
+        if not self.first:
+            return {}  # without a look at the world
+        starts = dict(zip(sorted(self.slam_on), self.frames(len(self.slam_on), 0), strict=True))
+        goals = {robot: first_of(starts[robot], offset) for robot, offset in self.first.items()}
+        return {robot: ["--first", *(f"{value:g}" for value in goal)] for robot, goal in goals.items()}
 
 
 def slam_task(robot: NodeId) -> str:

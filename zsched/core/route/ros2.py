@@ -24,6 +24,8 @@ from zsched.core.values.struct import Struct
 ANY: Final = "any"
 """In a fleet file: whatever type or hash the nodes use."""
 GID_BYTES: Final = 16
+DOMAIN: Final = "ROS_DOMAIN_ID"
+"""The environment variable by which a ROS 2 node chooses its domain."""
 MAX_DOMAIN: Final = 232
 """Largest ROS_DOMAIN_ID that ROS 2 allows anywhere."""
 TRANSIENT_LOCAL: Final = 1

@@ -50,8 +50,9 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
     told = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
     needed = len(told) if spec.reach is Reach.ALL else majority(len(told))
     fresh = told
-    if allocation.owner is not None and len(told) - _losing(allocation.owner, told) >= needed:
-        fresh = tuple(_with_margin(vector, allocation.owner) for vector in told)
+    if allocation.owner is not None and len(told) - _saying(allocation.owner, told, reachable=False) >= needed:
+        # a robot that refuses the owner for something else has not lost it by that
+        fresh = tuple(_with_margin(vector) for vector in told)
     columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
     reasons: dict[NodeId, str] = {}
     for vector in fresh:
@@ -68,7 +69,7 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
             # Not scored is not "not reached": only the latter is a reason to flee from an owner.
             vetoed[candidate] = reasons.get(candidate, "not scored by enough robots")
         elif reaching < needed:
-            at_limit = _reaching(candidate, told) - reaching
+            at_limit = _saying(candidate, told, reachable=True) - reaching
             told_of = f", by {at_limit} more at the limit of the signal (link.nu_dbm)" if at_limit else ""
             vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots{told_of}"
         else:
@@ -82,25 +83,23 @@ def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, Uti
     )
 
 
-def _reaching(candidate: NodeId, vectors: tuple[UtilityVector, ...]) -> int:
-    """By how many robots a candidate is reached, at the limit of its signal, too."""
-    return sum(any(one.candidate == candidate and one.reachable for one in vector.utilities) for vector in vectors)
+def _saying(candidate: NodeId, vectors: tuple[UtilityVector, ...], *, reachable: bool) -> int:
+    """How many robots say of a candidate that they reach it (at the limit of its signal, too), or that they do not."""
+    told = (vector.utilities for vector in vectors)
+    return sum(
+        any(one.candidate == candidate and one.reachable is reachable for one in utilities) for utilities in told
+    )
 
 
-def _losing(owner: NodeId, vectors: tuple[UtilityVector, ...]) -> int:
-    """How many robots do not reach the owner; one that they refuse for something else is not lost by that."""
-    return sum(any(one.candidate == owner and not one.reachable for one in vector.utilities) for vector in vectors)
-
-
-def _with_margin(vector: UtilityVector, owner: NodeId) -> UtilityVector:
-    """A robot's utilities while the owner is reached: another candidate at the limit of its signal is not."""
-    if not any(one.at_limit and one.candidate != owner for one in vector.utilities):
+def _with_margin(vector: UtilityVector) -> UtilityVector:
+    """A robot's utilities while the owner is reached, who is never at the limit: a candidate that is counts as lost."""
+    if not any(one.at_limit for one in vector.utilities):
         return vector
-    near = tuple(
-        Utility(candidate=one.candidate, value=0.0, reachable=False) if one.at_limit and one.candidate != owner else one
+    near = (
+        Utility(candidate=one.candidate, value=0.0, reachable=False) if one.at_limit else one
         for one in vector.utilities
     )
-    return replace(vector, utilities=near)
+    return replace(vector, utilities=tuple(near))
 
 
 def mean_of(aggregate: Aggregate) -> Callable[[list[float]], float]:
