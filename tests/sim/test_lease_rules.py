@@ -19,7 +19,7 @@ from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec, lease_terms
 from zsched.core.values.lease import RHO, hold_s
 from zsched.core.values.plan import WorkerRole
-from zsched.core.vote.lease import SENT_KEPT, Granter, Holder, Leases
+from zsched.core.vote.lease import LIVES_KEPT, SENT_KEPT, Granter, Holder, Leases
 
 LEASE_S, HOLD_S = 1.0, hold_s(1.0)
 ELECTORS = ("r1", "r2", "r3")
@@ -65,6 +65,18 @@ def test_another_owner_is_refused_until_the_hold_after_the_last_grant_is_over() 
     assert elector.may_accept("e1", 10.6)
     assert not elector.may_accept("e2", 10.5 + HOLD_S - 0.001)
     assert elector.may_accept("e2", 10.5 + HOLD_S)
+
+
+def test_what_an_owner_s_last_lives_have_released_is_known_and_no_more() -> None:
+    """An elector kept a number for each life of its owner, as long as it ran."""
+    elector = granter()
+    for life in range(1, 4 * LIVES_KEPT):
+        elector.on_beat(beat(number=9, life=life, released=(grant(9, life=life),)), None, 10.0)
+        elector.on_beat(beat("e2", released=(grant(5, owner="e2"),)), None, 10.0)
+    assert len(elector._released) == LIVES_KEPT + 1
+    for life in (3 * LIVES_KEPT, 4 * LIVES_KEPT - 1):
+        elector.on_beat(beat(number=9, life=life), ("e1", 3), 20.0)
+        assert elector.echo(20.0) is None, "a released number is never granted again"
 
 
 def test_the_hold_covers_a_whole_lease_on_the_slowest_clock() -> None:

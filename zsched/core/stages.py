@@ -332,13 +332,20 @@ class Stages:
                 if profile is not None:
                     yield name, profile
 
-    def unfit(self, task: TaskId) -> Mapping[NodeId, str]:
+    def unfit(self, task: TaskId, now: float) -> Mapping[NodeId, str]:
         """{node: why it can hold no lease} of an exclusive task; of any other one nobody needs any."""
-        return self.agreement.leases.unfit() if self.executors[task].is_leased else {}
+        if not self.executors[task].is_leased:
+            return {}
+        candidates = self.fleet.task(task).candidates
+
+        def misses(observer: NodeId, node: NodeId) -> bool:
+            return self.membership.misses(observer, node, now)
+
+        return self.agreement.leases.unfit(candidates, self.stateless, misses)
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
-        unfit = self.unfit(spec.name)
+        unfit = self.unfit(spec.name, now)
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)

@@ -1301,9 +1301,30 @@ VOTE_BUGS = (
     _bug(
         "an owner whose clock is in doubt is left like one that is only worse",
         "zsched.core.scheduler.judge",
-        "if veto == CLOCK_IN_DOUBT:",
+        "if veto is not None and veto.startswith(_LEASELESS):",
         "if False:",
         ("tests/sim/test_clock_doubt.py",),
+    ),
+    _bug(
+        "electors that an owner does not hear count for its lease",
+        "zsched.core.vote.lease",
+        "count = sum(not misses(node, elector) and not misses(elector, node) for elector in granting)",
+        "count = len(granting)",
+        ("tests/sim/test_lease_reach.py",),
+    ),
+    _bug(
+        "a machine whose worker was stuck once is avoided for good",
+        "zsched.core.gateway.shortfall",
+        "        if not is_explained:\n",
+        "        if False:\n",
+        ("tests/unit/core/gateway/test_shortfall.py",),
+    ),
+    _bug(
+        "each absence of an owner's worker has a start-up time of its own",
+        "zsched.core.scheduler.judge",
+        "self.not_ready_since = now - max(self.away_s - forgiven_s, 0.0)",
+        "self.not_ready_since = now",
+        ("tests/unit/core/scheduler/test_judge.py",),
     ),
     _bug(
         "a task goes back over a margin to an owner that can hold no lease",

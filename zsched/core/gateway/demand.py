@@ -141,6 +141,7 @@ class Demands:
             fair_cores: what a fair scheduler gives the task there while a job runs, >= 0; 0: nobody counts threads.
             heard: what robots see of the answers of a worker that reports no jobs; ``None``: nothing.
         """
+        self.shortfalls.end_doubts(task, now)
         load = profile.worker(task)
         known = self._known.get(task, _Known())
         if load is not None and load.state is not WorkerState.READY and known.owner == profile.node:

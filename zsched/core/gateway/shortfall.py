@@ -4,7 +4,8 @@ Knows: forecasts of work and of jobs' ages, what came of them. Does not know: ho
 
 The owner's service is measured, the candidates' foretold. So what a machine did not keep is remembered of it for as
 long as others use about as much there. Otherwise it would look better as soon as the task has left, and the task go
-there and back for ever (docs/decisions/0032).
+there and back for ever (docs/decisions/0032). Where no wait for CPU explains it (the worker was stuck once, a disk is
+slow for good), it is remembered for a minute, and twice as long each time that it is seen again (0135).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 from collections.abc import Container
 from typing import Final
 
-from zsched.core.gateway.company import Company
+from zsched.core.gateway.company import Company, is_full
 from zsched.core.gateway.job_need import JobNeed
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerLoad
@@ -23,6 +24,11 @@ SHORT_RATIO: Final = 0.9
 """A task that gets a smaller part of its forecast has a shortfall on that machine."""
 LAGS_S: Final = 4.0
 """Time constant of the age that is foretold: jobs' ages are means that follow later than the machine's figures."""
+DOUBT_S: Final = 60.0
+"""A shortfall that no wait for CPU explains is remembered for so long, the first time."""
+LONGEST_DOUBT_S: Final = 3600.0
+WAITING_RATIO: Final = 0.1
+"""A job that waits for a CPU for this share of its time is held up by others."""
 
 
 class _Foretold(Struct, frozen=True):
@@ -41,6 +47,19 @@ class _Shortfall(Struct, frozen=True):
     stretch: float
     """How many times as long its jobs took, at least 1."""
     company: Company
+    is_explained: bool = True
+    """By a wait for CPU: it ends with the others' use, and not by time."""
+
+
+class _Doubt(Struct, frozen=True):
+    """For how long a shortfall counts that nothing explains."""
+
+    for_s: float
+    seen_at: float
+
+    def is_over(self, now: float) -> bool:
+        """Whether the machine may be tried again."""
+        return now >= self.seen_at + self.for_s
 
 
 class Shortfalls:
@@ -49,6 +68,9 @@ class Shortfalls:
     def __init__(self) -> None:
         self._seen: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._foretold: dict[TaskId, _Foretold] = {}
+        self._doubts: dict[tuple[TaskId, NodeId], _Doubt] = {}
+        self._fine: dict[TaskId, tuple[NodeId, float]] = {}
+        """{task: (its owner, since when that has kept what it promised)}."""
 
     def note(
         self,
@@ -85,9 +107,39 @@ class Shortfalls:
         stretch = max(age_s / max(foretold_s, 1e-9), 1.0)
         before = self._seen.pop((task, profile.node), None)
         if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
+            self._trust(task, profile.node, now)
             return before is not None
-        self._seen[task, profile.node] = _Shortfall(share, stretch, company)
+        self._fine[task] = profile.node, now
+        is_explained = _waits(load, profile)
+        if not is_explained:
+            self._doubt(task, profile.node, now)
+        self._seen[task, profile.node] = _Shortfall(share, stretch, company, is_explained)
         return before != self._seen[task, profile.node]
+
+    def _doubt(self, task: TaskId, node: NodeId, now: float) -> None:
+        """A machine that has disappointed again after it was tried again is tried later the next time."""
+        known = self._doubts.get((task, node))
+        if known is None:
+            self._doubts[task, node] = _Doubt(DOUBT_S, now)
+        else:
+            for_s = min(2 * known.for_s, LONGEST_DOUBT_S) if known.is_over(now) else known.for_s
+            self._doubts[task, node] = _Doubt(for_s, now)
+
+    def _trust(self, task: TaskId, node: NodeId, now: float) -> None:
+        """The owner keeps what it promised; after as long as it was doubted, nothing is held against it."""
+        owner, since = self._fine.get(task, (node, now))
+        if owner != node:
+            since = now
+        self._fine[task] = node, since
+        doubt = self._doubts.get((task, node))
+        if doubt is not None and now >= since + doubt.for_s:
+            del self._doubts[task, node]
+
+    def end_doubts(self, task: TaskId, now: float) -> None:
+        """Forget what nothing explains and was not seen for long enough."""
+        over = {key for key, doubt in self._doubts.items() if key[0] == task and doubt.is_over(now)}
+        if over:
+            self._seen = {key: one for key, one in self._seen.items() if one.is_explained or key not in over}
 
     def _foretell(self, task: TaskId, node: NodeId, age_s: float, now: float) -> float:
         """The age that jobs' mean age is compared with: this one, or what was foretold of those that ended before.
@@ -109,11 +161,24 @@ class Shortfalls:
     def keep(self, nodes: Container[NodeId]) -> None:
         """Know nothing of other nodes."""
         self._seen = {key: seen for key, seen in self._seen.items() if key[1] in nodes}
+        self._doubts = {key: doubt for key, doubt in self._doubts.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
         self._foretold.pop(task, None)
+        self._fine.pop(task, None)
         self._seen = {key: seen for key, seen in self._seen.items() if key[0] != task}
+        self._doubts = {key: doubt for key, doubt in self._doubts.items() if key[0] != task}
+
+
+def _waits(load: WorkerLoad, profile: Profile) -> bool:
+    """Whether a worker waits for CPU; where nobody tells, whether its machine is full."""
+    jobs, use = load.jobs, load.cpu_cores or 0.0
+    told_s = None if jobs is None else jobs.wait_s
+    if load.wanted_cores is None and told_s is None:
+        return is_full(profile)
+    is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
+    return is_hungry or (jobs is not None and told_s is not None and told_s > WAITING_RATIO * jobs.time_s)
 
 
 def is_short(load: WorkerLoad) -> bool:

@@ -79,7 +79,7 @@ def unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
     spec = node.fleet.task(value.task).under(value.tuning)
     # Margins keep the task from what it would leave again by itself; an operator may send it there.
     left = frozenset() if value.owner is None else frozenset({value.owner})
-    doubts = Doubts(left=left, unfit=node.unfit(value.task))
+    doubts = Doubts(left=left, unfit=node.unfit(value.task, now))
     vector = score(spec, value, node.me, node.gateway, node.membership.states(), now, doubts=doubts)
     refused = dict(vector.refused)
     if target in refused and (node.rounds.is_voter or refused[target] != UNMEASURED.format("network")):

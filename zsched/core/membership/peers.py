@@ -23,7 +23,7 @@ owner that all others hear.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from zsched.core.sequence import Order, Track
 from zsched.core.values.beat import Beat
@@ -77,7 +77,8 @@ class _Peer(Struct):
     """Gone since it was last alive, even if another node's word has made it suspect again."""
     back_at: float = -math.inf
     """When it last came back from gone in the same life."""
-    suspects: tuple[NodeId, ...] = ()
+    accuses: Mapping[NodeId, float] = field(default_factory=dict)
+    """{node that it suspects or takes for gone: since when its beats say so}."""
     is_calm: bool = False
     """Its newest beat said so: the next one may come at the slow pace."""
     has_missed: bool = False
@@ -162,6 +163,22 @@ class Membership:
         excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
         return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
 
+    def misses(self, observer: NodeId, node: NodeId, now: float) -> bool:
+        """Whether ``observer`` has told, for as long as a suspect may refute it, that it does not hear ``node``.
+
+        An observer that is not heard here says nothing.
+        """
+        if observer == self._me:
+            peer = self._peers.get(node)
+            if peer is None or peer.state is PeerState.ALIVE:
+                return False
+            is_refutable = peer.state is PeerState.SUSPECT and now < peer.suspect_since + self._timing.confirm_s
+            return not is_refutable and (self._has_watched or peer.state is not PeerState.UNKNOWN)
+        told = self._peers.get(observer)
+        if told is None or told.state is not PeerState.ALIVE or node not in told.accuses:
+            return False
+        return now >= told.accuses[node] + self._timing.confirm_s
+
     @property
     def misses_anybody(self) -> bool:
         """Whether some node of the fleet file is not heard."""
@@ -225,7 +242,8 @@ class Membership:
         self._deadline = None
         peer.beat_at = now
         self._has_heard = True
-        peer.suspects, peer.token_lost = beat.suspects, False
+        peer.accuses = {name: peer.accuses.get(name, now) for name in beat.suspects}
+        peer.token_lost = False
         if known == beat.incarnation and beat.sequence == sequence + 1:
             self._note_way(silent_s, beat.loop_lag_s, now)
         peer.is_calm, peer.has_missed = beat.calm, sequence >= 0 and not restarted and beat.sequence > sequence + 1
@@ -261,7 +279,7 @@ class Membership:
     def _take_word(self, beat: Beat, now: float) -> list[Transition]:
         """A lost peer is back. Lost peers that it does not accuse should be heard soon."""
         changes = []
-        accused = {name for peer in self._peers.values() if peer.state is PeerState.ALIVE for name in peer.suspects}
+        accused = {name for peer in self._peers.values() if peer.state is PeerState.ALIVE for name in peer.accuses}
         for name, peer in self._peers.items():
             if peer.state is PeerState.GONE and name not in accused:
                 changes.append(self._change(name, PeerState.SUSPECT, f"{beat.node} is back and hears it", now))
@@ -354,7 +372,7 @@ class Membership:
 
     def _accused_by(self, name: NodeId) -> str:
         """Why a suspect is gone by another node's word; empty: nobody else misses it."""
-        accusers = (other for other, observer in self._observers(name) if name in observer.suspects)
+        accusers = (other for other, observer in self._observers(name) if name in observer.accuses)
         return next((f"{other} misses it too" for other in accusers), "")
 
     def _verdict(self, name: NodeId, peer: _Peer, now: float) -> str:

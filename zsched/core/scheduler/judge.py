@@ -13,6 +13,7 @@ import dataclasses
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from enum import StrEnum
+from typing import Final
 
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
@@ -22,10 +23,14 @@ from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
 from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
-from zsched.core.values.words import CLOCK_IN_DOUBT, told_of_worker
+from zsched.core.values.words import CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, told_of_worker
 
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
+_LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS)
+"""First words of vetoes by which an owner's exclusive worker cannot be at work for long."""
+FORGIVEN_RATIO: Final = 0.1
+"""An owner's worker that is ready makes up so much for the time in which it was not."""
 UNSCORED_S = 2.0
 """An owner that cannot be scored is left after this time: nobody knows the cost of staying there."""
 
@@ -59,6 +64,11 @@ class Judge:
     unscored_since: float | None = None
     """Since when the owner could not be scored, while somebody else could."""
     not_ready_since: float | None = None
+    """Since when the owner's worker is not ready; earlier by what of former times is not forgiven yet."""
+    away_s: float = 0.0
+    """For how long it was not ready when it became ready last."""
+    away_until: float | None = None
+    """When that was; ``None``: it has always been ready, or is not."""
     spent: float = 0.0
     """What staying has cost so far, in utility seconds."""
     spent_at: float | None = None
@@ -82,16 +92,31 @@ class Judge:
         """A vote was lost or the value changed: what staying has cost counts from nothing again."""
         self.unscored_since, self.spent, self.fit_since = None, 0.0, None
         if is_new_owner:
-            self.not_ready_since = None
+            self._forgive()
+
+    def _forgive(self) -> None:
+        """Nothing is held against the owner's worker."""
+        self.not_ready_since, self.away_s, self.away_until = None, 0.0, None
 
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
-        """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it."""
-        load = None if profile is None else profile.worker(self.spec.name)
-        if profile is None or (load is not None and load.state is WorkerState.READY):
-            self.not_ready_since = None
+        """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
+
+        Each second in which it is ready forgives `FORGIVEN_RATIO` of one: a worker that is ready now and then, and
+        never for long, would have a start-up time for each.
+        """
+        if profile is None:
+            self._forgive()
+            return 0.0
+        load = profile.worker(self.spec.name)
+        if load is not None and load.state is WorkerState.READY:
+            if self.not_ready_since is not None:
+                self.away_s = min(now - self.not_ready_since, self.spec.worker.start_deadline_s)
+                self.not_ready_since, self.away_until = None, now
             return 0.0
         if self.not_ready_since is None:
-            self.not_ready_since = now
+            forgiven_s = 0.0 if self.away_until is None else FORGIVEN_RATIO * (now - self.away_until)
+            self.not_ready_since = now - max(self.away_s - forgiven_s, 0.0)
+            self.away_s, self.away_until = 0.0, None
         return now - self.not_ready_since
 
     def is_overdue(self, now: float) -> bool:
@@ -105,6 +130,8 @@ class Judge:
         return JudgeMemory(
             unscored_since=self.unscored_since,
             not_ready_since=self.not_ready_since,
+            away_s=self.away_s,
+            away_until=self.away_until,
             spent=self.spent,
             spent_at=self.spent_at,
             seen_first_at=self.seen_first_at,
@@ -117,6 +144,7 @@ class Judge:
     def recall(self, memory: JudgeMemory) -> None:
         """Remember that, and nothing else."""
         self.unscored_since, self.not_ready_since = memory.unscored_since, memory.not_ready_since
+        self.away_s, self.away_until = memory.away_s, memory.away_until
         self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
         self.fit_since = memory.fit_since
         self.learnt = LearntPatience()
@@ -336,11 +364,11 @@ def escape_reason(
         if load is not None and load.renewal is Renewal.LEAVES:
             return f"{owner} gives it away: its worker starts again, by the changed fleet file"
         if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
-            return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s{why}"
+            return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s in all{why}"
     veto = standing.vetoed.get(owner)
     if veto is not None and veto.startswith("reached by"):
         return f"{owner} is {veto}"
-    if veto == CLOCK_IN_DOUBT:  # its exclusive worker has stopped at once
+    if veto is not None and veto.startswith(_LEASELESS):  # its exclusive worker has stopped, or is about to
         return f"{owner}: {veto}"
     return short_of_memory(spec, allocation, profile)
 

@@ -42,6 +42,8 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
 
     unscored_since: float | None = None
     not_ready_since: float | None = None
+    away_s: float = 0.0
+    away_until: float | None = None
     spent: float = 0.0
     spent_at: float | None = None
     seen_first_at: float | None = None

@@ -26,7 +26,8 @@ own.
   never granted again. Without this a planned move would never happen.
 * An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
   another electorate need not meet the one that granted to this owner's earlier life. A node with other terms gets no
-  leased task.
+  leased task. Nor does a node that does not hear a majority of the electors, or that they do not hear: its lease
+  ends, and no word of it, or of a robot, would ever say that its worker stands still.
 * A node whose clock is in doubt (`zsched.core.vote.clocks`) neither works nor grants, and its beats name other terms.
   Afterwards it begins like an elector, and an owner, that has just started.
 * The worker's own report that it has stopped ends the owner's wait before the lease does, but only once the worker was
@@ -40,7 +41,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
 from zsched.core.values.beat import Beat, Grant
@@ -49,12 +51,14 @@ from zsched.core.values.lease import hold_s
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import CLOCK_IN_DOUBT
+from zsched.core.values.words import CLOCK_IN_DOUBT, TOO_FEW_ELECTORS
 
 _IN_DOUBT = f", {CLOCK_IN_DOUBT}"
 """Behind the terms of a node's leases."""
 SENT_KEPT = 128
 """Newest numbers whose sending time an owner keeps; an echo of an older one gives no lease."""
+LIVES_KEPT = 8
+"""An elector knows what so many lives of an owner have released; who is older is dead, and its grants are over."""
 HURRY_S = 0.05
 """An empty release (nothing was used) causes a beat of its own at most this often."""
 
@@ -81,7 +85,7 @@ class Granter:
     _hold_s: float = 0.0
     """How long the last grant forbids another owner: by the lease under which it was given."""
     _released: dict[tuple[NodeId, int], int] = field(default_factory=dict)
-    """{(owner, incarnation): the largest released number}."""
+    """{(owner, incarnation): the largest released number}, of an owner's last `LIVES_KEPT` lives."""
     _silent_for: tuple[NodeId, int] | None = None
     """(owner, epoch) that is not echoed any more because another one waits."""
     _silent_until: float = -math.inf
@@ -134,7 +138,10 @@ class Granter:
 
     def _release(self, grant: Grant) -> None:
         key = (grant.owner, grant.incarnation)
-        self._released[key] = max(self._released.get(key, grant.number), grant.number)
+        self._released[key] = max(self._released.pop(key, grant.number), grant.number)
+        lives = [known for known in self._released if known[0] == grant.owner]
+        if len(lives) > LIVES_KEPT:
+            del self._released[lives[0]]
         last = self._last
         if last is not None and (last.owner, last.incarnation) == key and last.number <= grant.number:
             self._last, self._granted_at = None, -math.inf
@@ -613,9 +620,28 @@ class Leases:
                 holder.ask()
         return is_new
 
-    def unfit(self) -> dict[NodeId, str]:
-        """{node: why it could never hold a valid lease}."""
-        return {
+    def unfit(
+        self,
+        candidates: Iterable[NodeId] = (),
+        without_state: AbstractSet[NodeId] = frozenset(),
+        misses: Callable[[NodeId, NodeId], bool] = lambda _observer, _node: False,
+    ) -> dict[NodeId, str]:
+        """{node: why it could never hold a valid lease}.
+
+        Args:
+            candidates: those of them are told, too, that too few electors can grant anything.
+            without_state: electors that grant nothing.
+            misses: whether a node (the first) does not hear another one, as far as is known here.
+        """
+        granting = [name for name in self.electors if name not in self._others and name not in without_state]
+        if not self._grants or self.is_in_doubt:
+            granting = [name for name in granting if name != self.me]
+        needed, few = majority(len(self.electors)), {}
+        for node in candidates:
+            count = sum(not misses(node, elector) and not misses(elector, node) for elector in granting)
+            if count < needed:
+                few[node] = f"{TOO_FEW_ELECTORS} ({count} of {len(self.electors)})"
+        return few | {
             node: CLOCK_IN_DOUBT
             if terms.endswith(_IN_DOUBT)
             else f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"

@@ -8,7 +8,15 @@ import pytest
 
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.job_need import JobNeed
-from zsched.core.gateway.shortfall import LAGS_S, SHORT_RATIO, Shortfalls, is_short, shows_lack
+from zsched.core.gateway.shortfall import (
+    DOUBT_S,
+    LAGS_S,
+    LONGEST_DOUBT_S,
+    SHORT_RATIO,
+    Shortfalls,
+    is_short,
+    shows_lack,
+)
 from zsched.core.values.profile import Jobs, Profile, WorkerLoad
 
 
@@ -71,6 +79,113 @@ def test_it_is_forgotten_when_the_machine_keeps_what_it_promises() -> None:
     assert noted(shortfalls, fine, 0.1)
     assert shortfalls.of("merge", fine) == (1.0, 1.0)
     assert not noted(shortfalls, fine, 0.1)
+
+
+# --- what no wait for CPU explains -----------------------------------------------------------------------------------
+
+STUCK = replace(HELD_UP, wait_s=0.0)
+
+
+def of_stuck(*, cores: float = 0.4, others: float = 0.0, wanted: float | None = None, jobs: Jobs = STUCK) -> Profile:
+    """A machine of four cores whose worker leaves half of its jobs undone, and waits for no CPU."""
+    load = load_of(cpu_cores=cores, wanted_cores=wanted, jobs=jobs)
+    return profile_of("edge1", cpu_cores=4.0, cpu_used_cores=cores + others, workers=(load,))
+
+
+def is_held(shortfalls: Shortfalls, now: float, profile: Profile | None = None) -> bool:
+    """Whether anything is held against the machine, once the task has left it."""
+    shortfalls.end_doubts("merge", now)
+    return shortfalls.of("merge", profile or of_stuck(cores=0.0)) != (1.0, 1.0)
+
+
+def test_a_worker_that_was_stuck_once_is_held_against_its_machine_for_a_minute() -> None:
+    """It made an idle machine worth next to nothing for good: what others use there never changed."""
+    shortfalls = Shortfalls()
+    for step in range(5):
+        noted(shortfalls, of_stuck(), 0.2, now=float(step))
+    assert is_held(shortfalls, 4.0 + DOUBT_S - 0.1)
+    assert not is_held(shortfalls, 4.0 + DOUBT_S)
+
+
+def test_a_machine_that_disappoints_whenever_it_is_tried_is_tried_half_as_often_each_time() -> None:
+    """A disk that is slow for good: else the task would go there each minute."""
+    shortfalls, now, pauses = Shortfalls(), 0.0, []
+    for _ in range(9):
+        for _ in range(4):
+            noted(shortfalls, of_stuck(), 0.2, now=now)
+            noted(shortfalls, of_stuck(cores=0.8), 0.1, now=now + 0.5)
+            noted(shortfalls, of_stuck(), 0.2, now=now + 1.0)  # that comes and goes while the task is there
+            now += 1.0
+        pauses.append(next(for_s for for_s in range(10, 7200, 10) if not is_held(shortfalls, now + for_s)))
+        now += pauses[-1]
+    assert pauses == [min(DOUBT_S * 2**count, LONGEST_DOUBT_S) for count in range(9)]
+
+
+def test_a_machine_that_has_kept_its_word_for_as_long_as_it_was_doubted_begins_anew() -> None:
+    shortfalls = Shortfalls()
+    noted(shortfalls, of_stuck(), 0.2, now=0.0)
+    assert not is_held(shortfalls, DOUBT_S)
+    noted(shortfalls, of_stuck(), 0.2, now=DOUBT_S)
+    fine = of_stuck(cores=0.8)
+    for step in range(round(2 * DOUBT_S) + 1):
+        noted(shortfalls, fine, 0.1, now=DOUBT_S + 1.0 + step)
+    later = DOUBT_S + 1.0 + 2 * DOUBT_S
+    noted(shortfalls, of_stuck(), 0.2, now=later)
+    assert not is_held(shortfalls, later + DOUBT_S), "as the first time"
+
+
+def test_a_time_in_which_the_task_was_elsewhere_proves_nothing() -> None:
+    shortfalls = Shortfalls()
+    noted(shortfalls, of_stuck(), 0.2, now=0.0)
+    elsewhere = replace(of_stuck(cores=0.8), node="edge2")
+    for step in range(100):
+        noted(shortfalls, elsewhere, 0.1, now=1.0 + step)
+    assert not is_held(shortfalls, 101.0)
+    noted(shortfalls, of_stuck(cores=0.8), 0.1, now=101.0)
+    noted(shortfalls, of_stuck(), 0.2, now=102.0)
+    assert is_held(shortfalls, 102.0 + 1.9 * DOUBT_S)
+
+
+@pytest.mark.parametrize(
+    ("jobs", "wanted", "others", "is_for_good"),
+    [
+        (HELD_UP, None, 0.0, True),
+        (STUCK, 0.8, 0.0, True),
+        (STUCK, 0.4, 0.0, False),
+        (STUCK, None, 3.6, False),
+        (replace(STUCK, wait_s=None), 0.4, 3.6, False),
+    ],
+    ids=["jobs wait", "threads wait", "threads want no more", "nor on a full machine", "several threads"],
+)
+def test_who_waits_for_a_cpu_is_held_up_by_others_for_as_long_as_they_are_there(
+    jobs: Jobs, wanted: float | None, others: float, is_for_good: bool
+) -> None:
+    shortfalls = Shortfalls()
+    noted(shortfalls, of_stuck(jobs=jobs, wanted=wanted, others=others), 0.4)
+    left = of_stuck(cores=0.0, others=others)
+    assert is_held(shortfalls, DOUBT_S - 1.0, left)
+    assert is_held(shortfalls, 1e6, left) is is_for_good
+
+
+@pytest.mark.parametrize(("others", "is_for_good"), [(3.6, True), (0.0, False)])
+def test_where_the_kernel_does_not_tell_who_waits_a_full_machine_is_the_cause(others: float, is_for_good: bool) -> None:
+    shortfalls = Shortfalls()
+    noted(shortfalls, of_stuck(jobs=replace(STUCK, wait_s=None), others=others), 2.0)
+    left = of_stuck(cores=0.0, others=others)
+    assert is_held(shortfalls, 1.0, left)
+    assert is_held(shortfalls, 1e6, left) is is_for_good
+
+
+def test_of_a_task_or_a_node_that_is_no_more_nothing_is_remembered() -> None:
+    for is_of_task in (True, False):
+        shortfalls = Shortfalls()
+        noted(shortfalls, of_stuck(), 0.2, now=0.0)
+        if is_of_task:
+            shortfalls.forget("merge")
+        else:
+            shortfalls.keep(("edge2",))
+        noted(shortfalls, of_stuck(), 0.2, now=1000.0)
+        assert not is_held(shortfalls, 1000.0 + DOUBT_S), "it would wait for twice as long"
 
 
 def test_jobs_that_were_to_take_long_may_end_for_some_seconds_after_the_load_has() -> None:

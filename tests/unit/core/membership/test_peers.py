@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from random import Random
 
 import pytest
@@ -343,6 +344,29 @@ def test_observer_that_never_heard_a_peer_excuses_it_only_while_it_is_new() -> N
     ear.beat("b", 1.1)
     ear.members.tick(WIFI.suspect_s)
     assert ear.members.suspects() == ("a", "c")
+
+
+def test_a_node_misses_another_one_once_it_has_told_so_for_as_long_as_that_may_be_refuted() -> None:
+    ear = heard(LARGE)
+    ear.beat("b", 0.1, suspects=("a",))
+    ear.beat("b", 0.1 + WIFI.confirm_s / 2, suspects=("a",))
+    missed = partial(ear.members.misses, "b", "a")
+    assert not missed(0.1 + WIFI.confirm_s - 0.01)
+    assert missed(0.1 + WIFI.confirm_s)
+    assert not ear.members.misses("a", "b", 0.1 + WIFI.confirm_s), "the other way is another one"
+    ear.beat("b", 0.5)
+    ear.beat("b", 0.6, suspects=("a",))
+    assert not missed(0.6 + WIFI.confirm_s - 0.01), "it has heard it meanwhile"
+
+
+def test_what_this_node_misses_itself_counts_by_the_same_time() -> None:
+    ear = heard(LARGE)
+    ear.run(0.0, WIFI.suspect_s, ("b", "c"))
+    me = "me"
+    assert [ear.members.misses(me, name, WIFI.suspect_s) for name in ("a", "b", me)] == [False] * 3
+    ear.members.tick(WIFI.suspect_s)
+    assert ear.members.misses(me, "a", WIFI.suspect_s + WIFI.confirm_s)
+    assert not ear.members.misses("a", "b", 1e6), "who is not heard says nothing"
 
 
 # --- the token: fast path of a kill ----------------------------------------------------------------------------------

@@ -160,6 +160,57 @@ def test_a_new_owner_has_its_own_start_up_time() -> None:
     assert judge.not_ready_since is None
 
 
+def away(judge: Judge, *turns: tuple[WorkerState, float], start: float = 0.0) -> list[float]:
+    """Of each look, for how long the owner's worker was away; it is in each state for so many seconds."""
+    found, now = [], start
+    for state, for_s in turns:
+        for _ in range(round(for_s / 0.5)):
+            now += 0.5
+            found.append(judge.not_ready_for(profile(state=state), now))
+    return found
+
+
+def test_a_worker_that_is_ready_now_and_then_has_one_start_up_time_for_all_of_its_absences() -> None:
+    """18 s away of each 45: it was never left, for each time had a start-up time of its own."""
+    judge, turn = Judge(spec=SPEC), ((WorkerState.STARTING, 18.0), (WorkerState.READY, 27.0))
+    assert max(away(judge, *turn)) < DEADLINE_S
+    assert max(away(judge, *turn, start=45.0)) > DEADLINE_S
+    assert not judge.is_overdue(90.0), "now it is ready"
+
+
+def test_a_worker_that_is_ready_for_ten_times_as_long_has_all_its_time_again() -> None:
+    judge = Judge(spec=SPEC)
+    away(judge, (WorkerState.STARTING, 18.0), (WorkerState.READY, 181.0))
+    assert judge.not_ready_for(profile(state=WorkerState.STARTING), 199.5) == 0.0
+    assert max(away(judge, (WorkerState.STARTING, 18.0), start=199.5)) == 18.0
+
+
+def test_what_is_held_against_a_worker_is_at_most_its_start_up_time() -> None:
+    """Nobody else could have the task; once it is ready it has a tenth of that time for the next absence."""
+    judge = Judge(spec=SPEC)
+    away(judge, (WorkerState.STARTING, 500.0), (WorkerState.READY, 30.5))
+    assert judge.not_ready_for(profile(state=WorkerState.STARTING), 531.0) == pytest.approx(DEADLINE_S - 3.1, abs=0.2)
+
+
+@pytest.mark.parametrize("is_unheard", [True, False])
+def test_a_new_owner_and_one_that_was_not_heard_begin_with_nothing_held_against_them(is_unheard: bool) -> None:
+    judge = Judge(spec=SPEC)
+    away(judge, (WorkerState.STARTING, 18.0), (WorkerState.READY, 5.0))
+    if is_unheard:
+        judge.not_ready_for(None, 23.5)
+    else:
+        judge.reset(is_new_owner=True)
+    assert judge.not_ready_for(profile(state=WorkerState.STARTING), 24.0) == 0.0
+
+
+def test_what_is_held_against_a_worker_is_part_of_the_memory() -> None:
+    judge, other = Judge(spec=SPEC), Judge(spec=SPEC)
+    away(judge, (WorkerState.STARTING, 18.0), (WorkerState.READY, 5.0))
+    other.recall(judge.memory())
+    starting = profile(state=WorkerState.STARTING)
+    assert other.not_ready_for(starting, 24.0) == judge.not_ready_for(starting, 24.0) > 17.0
+
+
 @pytest.mark.parametrize("patience", [0.0, 0.1, 1000.0])
 def test_an_owner_that_cannot_be_scored_is_left_after_a_while_whatever_the_patience(patience: float) -> None:
     """Nobody knows what staying costs there: for an account that never fills it would stay for ever."""
@@ -475,7 +526,8 @@ def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
 def test_not_ready_is_an_escape_only_after_the_start_up_deadline(state: WorkerState | None) -> None:
     assert reason(profile(state=state), not_ready=DEADLINE_S) is None
     assert (
-        reason(profile(state=state), not_ready=DEADLINE_S + 0.5) == "the worker on edge1 has not been ready for 20.5 s"
+        reason(profile(state=state), not_ready=DEADLINE_S + 0.5)
+        == "the worker on edge1 has not been ready for 20.5 s in all"
     )
 
 
@@ -485,7 +537,7 @@ def test_a_foreign_worker_that_is_not_there_is_an_escape_after_the_same_deadline
     assert reason(told, not_ready=DEADLINE_S, spec=FOREIGN) is None
     assert (
         reason(told, not_ready=DEADLINE_S + 0.5, spec=FOREIGN)
-        == "the worker on edge1 has not been ready for 20.5 s: nobody subscribes to a/key"
+        == "the worker on edge1 has not been ready for 20.5 s in all: nobody subscribes to a/key"
     )
     assert reason(profile(state=None), not_ready=DEADLINE_S + 100.0, spec=FOREIGN) is None, "its daemon does not know"
 

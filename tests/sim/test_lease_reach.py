@@ -1,0 +1,126 @@
+"""An exclusive task whose owner robots reach and too few electors hear: its lease has ended, and no word says so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from support.fleets import fleet_of, task_of, tuning_of
+from zsched.core.events import HoldCommanded, MoveCommanded
+from zsched.core.status import build_snapshot
+from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.messages import Hold, HoldTask, MoveTask
+from zsched.core.values.model import Asked
+from zsched_lab.sim.simulator import Simulator
+
+TASK = task_of(
+    "guard",
+    tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+    patience=0.1,
+    worker=WorkerSpec(command=("true",)),
+    candidates=("edge1", "edge2"),
+    exclusive=True,
+)
+ROBOTS = ("robot1", "robot2")
+ELECTORS = ("base1", "base2", "base3")
+NODES = ("edge1", "edge2", *ROBOTS, *ELECTORS)
+
+
+def started(*, cool_down_s: float = 0.0, pinned: bool = False, electors: tuple[str, ...] = ELECTORS) -> Simulator:
+    """A fleet whose owner is edge1."""
+    task = replace(TASK, tuning=replace(TASK.tuning, cool_down_s=cool_down_s))
+    sim = Simulator(fleet=fleet_of(task, of=NODES, electors=electors), seed=1)
+    sim.start(*[name for name in NODES if name != "edge2"])
+    assert sim.run_until(lambda: working(sim) == "edge1", 20.0)
+    sim.start("edge2")
+    if pinned:
+        order = HoldTask(task="guard", hold=Hold.PIN, node="edge1", asked=Asked(by="ada@robot1"))
+        sim.deliver(sim.machines["robot1"], HoldCommanded(request=1, command=order))
+    sim.run(5.0)
+    assert working(sim) == "edge1"
+    return sim
+
+
+def working(sim: Simulator) -> str:
+    name, until = sim.working.get("guard", ("", -math.inf))
+    return name if until > sim.now else ""
+
+
+@pytest.mark.parametrize("hold", ["", "pin", "cool-down"])
+@pytest.mark.parametrize("ways", ["both", "to it", "from it"])
+def test_the_task_is_left_once_a_majority_of_the_electors_and_its_owner_do_not_hear_each_other(
+    hold: str, ways: str
+) -> None:
+    sim = started(cool_down_s=60.0 if hold == "cool-down" else 0.0, pinned=hold == "pin")
+    pairs = [("edge1", name) for name in ELECTORS[:2]]
+    if ways in ("both", "from it"):
+        sim.cuts.update(pairs)
+    if ways in ("both", "to it"):
+        sim.cuts.update((name, edge) for edge, name in pairs)
+    timing = sim.fleet.timing
+    assert sim.run_until(lambda: working(sim) == "edge2", timing.suspect_s + timing.confirm_s + 2.0)
+    sim.run(20.0)
+    assert working(sim) == "edge2", "it does not come back to where it would stand still"
+    order = MoveTask(task="guard", node="edge1", asked=Asked(by="ada@robot1"))
+    sim.deliver(sim.machines["robot2"], MoveCommanded(request=2, command=order))
+    sim.run(1.0)
+    detail = next(one.result.detail for one in sim.answers if one.request == 2)
+    if hold == "":
+        assert detail == "edge1 cannot have it: too few electors can give it a lease (1 of 3)"
+    sim.heal()
+    sim.run(10.0)
+    assert sim.unsettled() == ""
+
+
+def test_one_elector_that_the_owner_does_not_hear_is_not_missed() -> None:
+    sim = started()
+    sim.cut(("edge1",), ELECTORS[:1])
+    for _ in range(100):
+        sim.run(0.1)
+        assert working(sim) == "edge1"
+
+
+def test_a_silence_that_is_refuted_in_time_moves_nothing() -> None:
+    sim = started()
+    sim.cut(("edge1",), ELECTORS[:2])
+    sim.run(sim.fleet.timing.suspect_s - 0.3)
+    sim.heal()
+    sim.run(10.0)
+    assert working(sim) == "edge1"
+
+
+def test_an_owner_that_is_an_elector_counts_itself() -> None:
+    sim = started(electors=("edge1", "base1", "base2"))
+    sim.cut(("edge1",), ("base1",))
+    sim.run(10.0)
+    assert working(sim) == "edge1"
+    sim.cut(("edge1",), ("base1", "base2"))
+    assert sim.run_until(lambda: working(sim) == "edge2", 5.0)
+
+
+def test_where_nobody_else_has_a_lease_either_the_task_waits_and_goes_on() -> None:
+    sim = started()
+    sim.cut(("edge1", "edge2"), ELECTORS[:2])
+    sim.run(10.0)
+    assert working(sim) == ""
+    assert sim.agreed("guard") == "edge1"
+    for name in ("robot1", "base1"):
+        (told,) = (task.problems for task in build_snapshot(sim.node(name), sim.now).tasks)
+        assert told[0] == "edge1 rests, for it has no lease: too few electors can give it a lease (1 of 3)"
+    sim.heal()
+    assert sim.run_until(lambda: working(sim) == "edge1", 5.0)
+    sim.run(1.0)
+    assert build_snapshot(sim.node("robot1"), sim.now).tasks[0].problems == ()
+
+
+def test_an_elector_whose_state_is_lost_counts_for_nobody() -> None:
+    sim = started()
+    sim.crash("base3")
+    sim.machines["base3"].disk.wipe()
+    sim.start("base3")
+    sim.run(3.0)
+    assert working(sim) == "edge1"
+    sim.cut(("edge1",), ("base1",))
+    assert sim.run_until(lambda: working(sim) == "edge2", 6.0)
