@@ -683,8 +683,8 @@ MEMBERSHIP_BUGS = (
     _bug(
         "second observer not needed",
         MEMBERSHIP,
-        "if name in observer.suspects)",
-        "if observer.suspects or True)",
+        "if name in observer.accuses)",
+        "if observer.accuses or True)",
         _MEMBERSHIP,
     ),
     _bug(
