@@ -38,7 +38,10 @@ def test_an_elector_is_removed_and_another_added_and_the_task_never_stops() -> N
     result = play.told("robot2", ChangeFleet(remove_elector="robot1"))
     assert result.outcome is CommandOutcome.OK
     early = play.told("robot2", ChangeFleet(add_elector="edge1", disk=play.disk("edge1")))
-    assert (early.outcome, early.detail) == (CommandOutcome.INVALID, "number 3 is not settled")
+    assert (early.outcome, early.detail) == (
+        CommandOutcome.INVALID,
+        "number 3 is not settled: a majority of its electors must answer first",
+    )
     play.settle()
     result = play.told("robot3", ChangeFleet(add_elector="edge1", disk=play.disk("edge1")))
     assert result.outcome is CommandOutcome.OK

@@ -88,7 +88,7 @@ def test_electors_die_one_after_another_and_are_replaced() -> None:
     assert not play.sim.run_until(lambda: len(play.electors()) != 3, 3 * REPLACE_S)
     quorum = build_snapshot(play.sim.node(play.sim.running()[0]), play.sim.now).quorum
     assert quorum.names == play.electors()
-    assert quorum.pilot.endswith("is gone, and no node is fit to follow it: two electors are no better than three")
+    assert "is gone, and no node is fit to follow it: two electors are no better than three" in quorum.pilot
 
 
 def test_an_elector_that_has_lost_its_disk_is_replaced_and_the_log_says_why() -> None:

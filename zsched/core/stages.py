@@ -56,6 +56,7 @@ from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Ta
 from zsched.core.values.plan import StreamCount, WorkerRole
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import CLOCK_IN_DOUBT
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
@@ -336,12 +337,30 @@ class Stages:
         """{node: why it can hold no lease} of an exclusive task; of any other one nobody needs any."""
         if not self.executors[task].is_leased:
             return {}
-        candidates = self.fleet.task(task).candidates
+        owner, confirm_s, misses = self.registers[task].value.owner, self.fleet.timing.confirm_s, self.membership.misses
 
-        def misses(observer: NodeId, node: NodeId) -> bool:
-            return self.membership.misses(observer, node, now)
+        def are_apart(node: NodeId, elector: NodeId) -> bool:
+            # An owner may refute it; whoever loses the same electors a moment later would get the task for nothing
+            for_s = confirm_s if node == owner else 0.0
+            return misses(node, elector, now, for_s) or misses(elector, node, now, for_s)
 
-        return self.agreement.leases.unfit(candidates, self.stateless, misses)
+        return self.agreement.leases.unfit(self.fleet.task(task).candidates, self.stateless, are_apart)
+
+    def resting(self, now: float) -> Mapping[TaskId, str]:
+        """{exclusive task that this node owns and may not work on: why}, once that lasts."""
+        leases, found = self.agreement.leases, dict[TaskId, str]()
+        if not leases.is_holding:
+            return found
+        leaving = leases.leaving()
+        for task in self.owned():
+            since = max(self.tenure.leased_at.get(task, -math.inf), self.rounds.tasks[task].settled_at)
+            if task in leaving:
+                continue
+            if self.executors[task].is_leased and now >= since + self.fleet.timing.suspect_s:
+                why = self.unfit(task, now).get(self.me, "no majority of the electors grants one")
+                why = CLOCK_IN_DOUBT if leases.is_in_doubt else why
+                found[task] = f"it rests, for it has no lease ({why})"
+        return found
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)

@@ -466,8 +466,6 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             f"the changed worker runs on {first or 'no node'} first, {', '.join(held) or 'no node'} {wait} with that "
             f"of before: `zsched task promote {task.name}` goes on"
         )
-    if owner is not None and (why := node.unfit(task.name, now).get(owner)):
-        yield f"{owner} rests, for it has no lease: {why}"
     if executor.is_local:
         yield f"cut off from {owner}: this robot works alone, degraded"
     server, is_server_ready = node.me if executor.is_local else owner, True

@@ -1308,7 +1308,7 @@ VOTE_BUGS = (
     _bug(
         "electors that an owner does not hear count for its lease",
         "zsched.core.vote.lease",
-        "count = sum(not misses(node, elector) and not misses(elector, node) for elector in granting)",
+        "count = sum(not are_apart(node, elector) for elector in granting)",
         "count = len(granting)",
         ("tests/sim/test_lease_reach.py",),
     ),
@@ -1322,7 +1322,7 @@ VOTE_BUGS = (
     _bug(
         "each absence of an owner's worker has a start-up time of its own",
         "zsched.core.scheduler.judge",
-        "self.not_ready_since = now - max(self.away_s - forgiven_s, 0.0)",
+        "self.not_ready_since = now - self.held_s",
         "self.not_ready_since = now",
         ("tests/unit/core/scheduler/test_judge.py",),
     ),

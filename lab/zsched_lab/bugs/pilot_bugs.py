@@ -47,7 +47,7 @@ PILOT_BUGS: tuple[Bug, ...] = (
         "an elector that has slept believes its clock",
         ("            self._listens_since = now\n", "            pass\n"),
     ),
-    _bug("an opinion of long ago counts", ("now - peer.at < course.silence_s and _answers", "_answers")),
+    _bug("an opinion of long ago counts", ("now - peer.at < silence_s and _answers", "_answers")),
     _bug(
         "an opinion under another number counts",
         (" for name, word in words if word.is_current]", " for name, word in words]"),
@@ -116,8 +116,8 @@ PILOT_BUGS: tuple[Bug, ...] = (
     _bug(
         "who was never heard is counted on",
         (
-            "if peer is not None and now - peer.at < course.silence_s and _answers(seat, peer.word):",
-            "if peer is None or now - peer.at < course.silence_s:",
+            "if peer is not None and now - peer.at < silence_s and _answers(seat, peer.word):",
+            "if peer is None or now - peer.at < silence_s:",
         ),
     ),
     _bug("electors that the operator has named are replaced", ("if not course.is_auto:", "if not course.members:")),

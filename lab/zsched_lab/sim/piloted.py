@@ -43,6 +43,7 @@ from zsched_lab.sim.electors import (
 
 BEAT_S: Final = 0.2
 SILENCE_S: Final = 1.2
+SUSPECT_S: Final = 0.9
 AWAY_S: Final = 4.0
 LEASE_S: Final = 1.0
 STAGGER_S: Final = 0.3
@@ -97,7 +98,7 @@ class Piloted(Machines):
         tasks = tuple(tasks)
         self._exclusive = {task for task, is_exclusive in tasks if is_exclusive}
         members = tuple((name, kind_of(name)) for name in sorted(self.names))
-        self._course = Course(members=members, is_auto=is_auto, silence_s=SILENCE_S, away_s=AWAY_S)
+        self._course = Course(members=members, is_auto=is_auto, silence_s=SILENCE_S, suspect_s=SUSPECT_S, away_s=AWAY_S)
         self._fleet = Fleet(
             name=FLEET,
             timing=changed(Timing(), lease_s=LEASE_S),

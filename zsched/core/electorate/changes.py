@@ -199,7 +199,7 @@ FleetChange = AdoptDocument | AddElector | RemoveElector | SetLease | SetDocumen
 def _unsettled(read: FleetValue) -> str:
     if not read.document:
         return "no document is agreed yet"
-    return "" if read.settled else f"number {read.number} is not settled"
+    return "" if read.settled else f"number {read.number} is not settled: a majority of its electors must answer first"
 
 
 def _renumbered(read: FleetValue, electors: tuple[Elector, ...]) -> FleetValue:

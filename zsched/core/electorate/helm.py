@@ -118,6 +118,7 @@ def course_of(fleet: Fleet, flags: tuple[Flag, ...] = ()) -> Course:
         members=tuple((node.name, node.kind) for node in fleet.nodes),
         is_auto=fleet.is_auto,
         silence_s=fleet.replace_s,
+        suspect_s=fleet.timing.suspect_s,
         away_s=fleet.away_s,
         leaving=tuple(flag.subject for flag in flags if flag.kind is FlagKind.LEAVE),
     )

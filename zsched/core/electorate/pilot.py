@@ -14,7 +14,8 @@ Knows: what this node has heard in beats, what other electors think, the fleet v
   disk of its newest beat.
 * Two electors are no better than three of which one is gone: so the third goes only when a spare is there. Two never
   become one but by a leave, for a majority of two is both. The last one stays.
-* A leaver is removed once those that are heard without it are a majority of the electors that stay: else whoever is
+* A leaver is removed once those that are heard without it, within the time in which silence is no suspicion, are a
+  majority of the electors that stay: else whoever is
   gone is replaced first. A single elector that leaves takes a second one, if one is fit, and goes then.
 * A leaver stays until it has learnt a settled value without it (`may_go`).
 * The aim is an odd number, at most `TARGET`, of robots and edges alike, of those the steadiest.
@@ -53,6 +54,8 @@ class Course(Struct, frozen=True, kw_only=True, dict=True):
     """Whether electors are replaced by themselves; otherwise the operator has named them, and they stay."""
     silence_s: float
     """T: an elector that is not heard for this long is gone (seconds, > 0)."""
+    suspect_s: float
+    """An elector that is not heard for this long may be gone: a leave does not count on it (seconds, > 0)."""
     away_s: float
     """A robot that is not heard for this long does not vote (seconds, >= ``silence_s``)."""
     leaving: tuple[NodeId, ...] = ()
@@ -232,7 +235,7 @@ class Pilot:
         if leaver is not None:
             if count == 1:
                 return _none(f"{leaver} is the last elector, and stays")
-            staying = [name for name in self._alive(value, course, now) if name != leaver]
+            staying = [name for name in self._alive(value, course, now, course.suspect_s) if name != leaver]
             if len(staying) >= majority(count - 1):
                 return _remove(value, leaver, "it leaves")
             told.append(f"{leaver} leaves when {majority(count - 1)} of the other electors are alive")
@@ -244,7 +247,8 @@ class Pilot:
             told += [f"{'; '.join(doubted)}: {needed} electors must say so"] if doubted else []
             return _none("; ".join(told)) if told else None
         if count == 3 and not self._fit(value, course, now, instead=lost):
-            return _none(f"{lost} is gone, and no node is fit to follow it: two electors are no better than three")
+            why = f"{lost} is gone, and no node is fit to follow it: two electors are no better than three"
+            return _none("; ".join([*told, f"{why}; start it again, or bring another node"]))
         return _remove(value, lost, f"gone for {', '.join(opinions[lost])}")
 
     def _who_miss(self, name: NodeId, value: FleetValue, course: Course, now: float) -> list[NodeId]:
@@ -258,12 +262,12 @@ class Pilot:
         words = ((name, self._peers[name].word) for name in self._alive(value, course, now) if name != self.me)
         return [(name, word) for name, word in words if word.is_current]
 
-    def _alive(self, value: FleetValue, course: Course, now: float) -> list[NodeId]:
+    def _alive(self, value: FleetValue, course: Course, now: float, within_s: float = math.inf) -> list[NodeId]:
         """The electors that this node hears, itself included; who was never heard is not, however new its seat is."""
-        heard = []
+        silence_s, heard = min(course.silence_s, within_s), []
         for seat in value.electors:
             peer = self._peers.get(seat.name)
-            if peer is not None and now - peer.at < course.silence_s and _answers(seat, peer.word):
+            if peer is not None and now - peer.at < silence_s and _answers(seat, peer.word):
                 heard.append(seat.name)
         return sorted({*heard, self.me})
 

@@ -37,6 +37,8 @@ class Tenure:
     clock: ClockDoubt = field(default_factory=ClockDoubt)
     voters: tuple[NodeId, ...] = field(init=False)
     """The robots that count: without a majority of them this node is cut off; of the electors, if it alone does."""
+    leased_at: dict[TaskId, float] = field(default_factory=dict)
+    """{exclusive task: when this node last held a valid lease of it}."""
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
@@ -47,6 +49,7 @@ class Tenure:
         """Go by ``fleet``, whose tasks the executors are for already."""
         self.fleet = fleet
         self._note_leased()
+        self.leased_at = {task: at for task, at in self.leased_at.items() if task in self.executors}
         self.voters = self.fleet.voters
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
         self._alone_since = {task: at for task, at in self._alone_since.items() if task in self._local}
@@ -124,6 +127,8 @@ class Tenure:
             before = executor.role
             if task not in leaving and not self.leases.is_in_doubt:
                 until = self.leases.until(task)
+                if until > now:
+                    self.leased_at[task] = now
                 executor.set_lease(until, todo, now)
                 if executor.role is not before:
                     self.leases.on_given(task, until)

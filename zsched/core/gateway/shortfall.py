@@ -27,6 +27,10 @@ LAGS_S: Final = 4.0
 DOUBT_S: Final = 60.0
 """A shortfall that no wait for CPU explains is remembered for so long, the first time."""
 LONGEST_DOUBT_S: Final = 3600.0
+TRUST_S: Final = 600.0
+"""A machine that keeps its promises for so long is doubted for half as long the next time."""
+TOLD_S: Final = 5.0
+"""Two figures of one owner are further apart only where it had no figures, or the task was elsewhere."""
 WAITING_RATIO: Final = 0.1
 """A job that waits for a CPU for this share of its time is held up by others."""
 
@@ -51,15 +55,31 @@ class _Shortfall(Struct, frozen=True):
     """By a wait for CPU: it ends with the others' use, and not by time."""
 
 
-class _Doubt(Struct, frozen=True):
+class _Doubt(Struct):
     """For how long a shortfall counts that nothing explains."""
 
     for_s: float
     seen_at: float
+    kept_s: float = 0.0
+    """For how long the machine has kept what it promised since then, with the task on it."""
+    kept_at: float = -math.inf
 
     def is_over(self, now: float) -> bool:
         """Whether the machine may be tried again."""
         return now >= self.seen_at + self.for_s
+
+    def see(self, now: float) -> None:
+        """It has happened again: once the machine was tried again, twice as long counts the next time."""
+        if self.is_over(now):
+            halved = self.for_s * 0.5 ** (self.kept_s // TRUST_S)
+            self.for_s = min(max(2 * halved, DOUBT_S), LONGEST_DOUBT_S)
+        self.seen_at, self.kept_s, self.kept_at = now, 0.0, now
+
+    def keep(self, now: float) -> None:
+        """The machine has kept what it promised; a time of which nobody has told anything proves nothing."""
+        if now - self.kept_at <= TOLD_S:
+            self.kept_s += now - self.kept_at
+        self.kept_at = now
 
 
 class Shortfalls:
@@ -69,8 +89,6 @@ class Shortfalls:
         self._seen: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._foretold: dict[TaskId, _Foretold] = {}
         self._doubts: dict[tuple[TaskId, NodeId], _Doubt] = {}
-        self._fine: dict[TaskId, tuple[NodeId, float]] = {}
-        """{task: (its owner, since when that has kept what it promised)}."""
 
     def note(
         self,
@@ -107,33 +125,14 @@ class Shortfalls:
         stretch = max(age_s / max(foretold_s, 1e-9), 1.0)
         before = self._seen.pop((task, profile.node), None)
         if share >= SHORT_RATIO and stretch <= 1.0 / SHORT_RATIO:
-            self._trust(task, profile.node, now)
+            if (doubt := self._doubts.get((task, profile.node))) is not None:
+                doubt.keep(now)
             return before is not None
-        self._fine[task] = profile.node, now
         is_explained = _waits(load, profile)
         if not is_explained:
-            self._doubt(task, profile.node, now)
+            self._doubts.setdefault((task, profile.node), _Doubt(DOUBT_S, now)).see(now)
         self._seen[task, profile.node] = _Shortfall(share, stretch, company, is_explained)
         return before != self._seen[task, profile.node]
-
-    def _doubt(self, task: TaskId, node: NodeId, now: float) -> None:
-        """A machine that has disappointed again after it was tried again is tried later the next time."""
-        known = self._doubts.get((task, node))
-        if known is None:
-            self._doubts[task, node] = _Doubt(DOUBT_S, now)
-        else:
-            for_s = min(2 * known.for_s, LONGEST_DOUBT_S) if known.is_over(now) else known.for_s
-            self._doubts[task, node] = _Doubt(for_s, now)
-
-    def _trust(self, task: TaskId, node: NodeId, now: float) -> None:
-        """The owner keeps what it promised; after as long as it was doubted, nothing is held against it."""
-        owner, since = self._fine.get(task, (node, now))
-        if owner != node:
-            since = now
-        self._fine[task] = node, since
-        doubt = self._doubts.get((task, node))
-        if doubt is not None and now >= since + doubt.for_s:
-            del self._doubts[task, node]
 
     def end_doubts(self, task: TaskId, now: float) -> None:
         """Forget what nothing explains and was not seen for long enough."""
@@ -166,7 +165,6 @@ class Shortfalls:
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
         self._foretold.pop(task, None)
-        self._fine.pop(task, None)
         self._seen = {key: seen for key, seen in self._seen.items() if key[0] != task}
         self._doubts = {key: doubt for key, doubt in self._doubts.items() if key[0] != task}
 

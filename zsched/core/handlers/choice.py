@@ -31,7 +31,7 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
         is_draining=node.is_draining,
         now=now,
         progress=node.hangs.reports(now),
-        reasons=node.workers.told(now),
+        reasons={**node.resting(now), **node.workers.told(now)},
         echoes=node.round_trips.echoes(now),
         relay=node.relay_ends.told(now),
         answers=node.answers.told(now),

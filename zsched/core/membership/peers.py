@@ -31,6 +31,8 @@ from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, PeerState
 from zsched.core.values.struct import Struct, field
 
+NEW_TIMES = 2.0
+"""A peer that has restarted has listened for long enough after so many times ``suspect_s``."""
 SMALL_FLEET = 3
 """Up to this size nobody waits for a second observer: there is at most one, and it may be the next to go."""
 MAX_LAG_FACTOR = 3.0
@@ -79,6 +81,9 @@ class _Peer(Struct):
     """When it last came back from gone in the same life."""
     accuses: Mapping[NodeId, float] = field(default_factory=dict)
     """{node that it suspects or takes for gone: since when its beats say so}."""
+    accused_before: Mapping[NodeId, float] = field(default_factory=dict)
+    """The same of its life before: one that has just started accuses nobody, because it is new."""
+    is_new_until: float = -math.inf
     is_calm: bool = False
     """Its newest beat said so: the next one may come at the slow pace."""
     has_missed: bool = False
@@ -163,21 +168,22 @@ class Membership:
         excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
         return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
 
-    def misses(self, observer: NodeId, node: NodeId, now: float) -> bool:
-        """Whether ``observer`` has told, for as long as a suspect may refute it, that it does not hear ``node``.
+    def misses(self, observer: NodeId, node: NodeId, now: float, for_s: float) -> bool:
+        """Whether ``observer`` has told for as long as ``for_s`` (seconds, >= 0) that it does not hear ``node``.
 
-        An observer that is not heard here says nothing.
+        An observer that is not heard here says nothing; for one that has just started its life before speaks.
         """
         if observer == self._me:
             peer = self._peers.get(node)
             if peer is None or peer.state is PeerState.ALIVE:
                 return False
-            is_refutable = peer.state is PeerState.SUSPECT and now < peer.suspect_since + self._timing.confirm_s
-            return not is_refutable and (self._has_watched or peer.state is not PeerState.UNKNOWN)
+            is_young = peer.state is PeerState.SUSPECT and now < peer.suspect_since + for_s
+            return not is_young and (self._has_watched or peer.state is not PeerState.UNKNOWN)
         told = self._peers.get(observer)
-        if told is None or told.state is not PeerState.ALIVE or node not in told.accuses:
+        if told is None or told.state is not PeerState.ALIVE:
             return False
-        return now >= told.accuses[node] + self._timing.confirm_s
+        before = told.accused_before if now < told.is_new_until else {}
+        return now >= min(told.accuses.get(node, math.inf), before.get(node, math.inf)) + for_s
 
     @property
     def misses_anybody(self) -> bool:
@@ -242,6 +248,8 @@ class Membership:
         self._deadline = None
         peer.beat_at = now
         self._has_heard = True
+        if restarted:
+            peer.accused_before, peer.is_new_until = peer.accuses, now + NEW_TIMES * self._timing.suspect_s
         peer.accuses = {name: peer.accuses.get(name, now) for name in beat.suspects}
         peer.token_lost = False
         if known == beat.incarnation and beat.sequence == sequence + 1:

@@ -209,7 +209,7 @@ def _escape(judge: Judge, standing: Standing, figures: Figures) -> str | None:
     if state is PeerState.SUSPECT and not figures.is_called_escape:
         state = PeerState.ALIVE  # in grace; only a peer's word makes our own suspicion enough
     not_ready_for = judge.not_ready_for(profile, figures.now)
-    return escape_reason(judge.spec, allocation, state, profile, standing, not_ready_for)
+    return escape_reason(judge.spec, allocation, state, profile, standing, not_ready_for, judge.held_s)
 
 
 def _look_ahead(judge: Judge, judgement: Judgement, standing: Standing, figures: Figures) -> Judgement:

@@ -64,11 +64,11 @@ class Judge:
     unscored_since: float | None = None
     """Since when the owner could not be scored, while somebody else could."""
     not_ready_since: float | None = None
-    """Since when the owner's worker is not ready; earlier by what of former times is not forgiven yet."""
+    """Since when the owner's worker is not ready; earlier by what former absences take of its time."""
     away_s: float = 0.0
-    """For how long it was not ready when it became ready last."""
+    """What of its absences before this one, or before it became ready last, is not forgiven yet."""
     away_until: float | None = None
-    """When that was; ``None``: it has always been ready, or is not."""
+    """When it became ready last; ``None``: it has always been ready, or is not."""
     spent: float = 0.0
     """What staying has cost so far, in utility seconds."""
     spent_at: float | None = None
@@ -101,8 +101,10 @@ class Judge:
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
 
-        Each second in which it is ready forgives `FORGIVEN_RATIO` of one: a worker that is ready now and then, and
-        never for long, would have a start-up time for each.
+        A worker that is ready now and then, and never for long, would have a start-up time for each absence. So they
+        add up, each for a start-up time at most, and a second in which it is ready forgives `FORGIVEN_RATIO` of one.
+        What is more than one start-up time counts to the next absence: a worker that is started anew on purpose, once
+        or twice, takes nobody's patience.
         """
         if profile is None:
             self._forgive()
@@ -110,14 +112,19 @@ class Judge:
         load = profile.worker(self.spec.name)
         if load is not None and load.state is WorkerState.READY:
             if self.not_ready_since is not None:
-                self.away_s = min(now - self.not_ready_since, self.spec.worker.start_deadline_s)
+                self.away_s += min(now - self.not_ready_since - self.held_s, self.spec.worker.start_deadline_s)
                 self.not_ready_since, self.away_until = None, now
             return 0.0
         if self.not_ready_since is None:
             forgiven_s = 0.0 if self.away_until is None else FORGIVEN_RATIO * (now - self.away_until)
-            self.not_ready_since = now - max(self.away_s - forgiven_s, 0.0)
-            self.away_s, self.away_until = 0.0, None
+            self.away_s, self.away_until = max(self.away_s - forgiven_s, 0.0), None
+            self.not_ready_since = now - self.held_s
         return now - self.not_ready_since
+
+    @property
+    def held_s(self) -> float:
+        """What former absences take of an owner's start-up time, in seconds."""
+        return max(self.away_s - self.spec.worker.start_deadline_s, 0.0)
 
     def is_overdue(self, now: float) -> bool:
         """Whether the owner's worker was heard not to be ready for longer than a start may take."""
@@ -332,6 +339,7 @@ def escape_reason(
     profile: Profile | None,
     standing: Standing,
     not_ready_for_s: float,
+    held_s: float = 0.0,
 ) -> str | None:
     """Why the owner must be left now, without patience or cool-down (but never without the quorum).
 
@@ -344,6 +352,7 @@ def escape_reason(
         profile: the owner's newest fresh profile.
         standing: the joint view (its veto of the owner is an escape).
         not_ready_for_s: for how long the owner's worker was heard not to be ready.
+        held_s: of that, what former absences count (`Judge.held_s`).
     """
     owner = allocation.owner
     if owner is None:
@@ -363,8 +372,10 @@ def escape_reason(
             return f"the worker on {owner} failed{why}"
         if load is not None and load.renewal is Renewal.LEAVES:
             return f"{owner} gives it away: its worker starts again, by the changed fleet file"
-        if _is_told(spec, profile) and not_ready_for_s > spec.worker.start_deadline_s:
-            return f"the worker on {owner} has not been ready for {not_ready_for_s:.1f} s in all{why}"
+        start_s = spec.worker.start_deadline_s
+        if _is_told(spec, profile) and not_ready_for_s > start_s:
+            often = f", and {start_s + held_s:.0f} s of the time before" if held_s else ""
+            return f"the worker on {owner} has not been ready for {not_ready_for_s - held_s:.1f} s{often}{why}"
     veto = standing.vetoed.get(owner)
     if veto is not None and veto.startswith("reached by"):
         return f"{owner} is {veto}"

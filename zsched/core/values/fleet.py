@@ -176,8 +176,8 @@ class WorkerSpec:
     env: tuple[tuple[str, str], ...] = key((), "Environment.")
     start_deadline_s: float = key(
         20.0,
-        "Ready within this time, or the start has failed. The worker of an owner may be away for this time; "
-        "what it was away before counts, less a tenth of the time in which it was ready since.",
+        "Ready within this time, or the start has failed. The worker of an owner may be away for this time; for less "
+        "where absences before, less a tenth of the time between them, come to more than it.",
         SECONDS,
     )
     stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL; at the daemon's own end 0.35 s.", SECONDS)

@@ -624,21 +624,21 @@ class Leases:
         self,
         candidates: Iterable[NodeId] = (),
         without_state: AbstractSet[NodeId] = frozenset(),
-        misses: Callable[[NodeId, NodeId], bool] = lambda _observer, _node: False,
+        are_apart: Callable[[NodeId, NodeId], bool] = lambda _node, _elector: False,
     ) -> dict[NodeId, str]:
         """{node: why it could never hold a valid lease}.
 
         Args:
             candidates: those of them are told, too, that too few electors can grant anything.
             without_state: electors that grant nothing.
-            misses: whether a node (the first) does not hear another one, as far as is known here.
+            are_apart: whether a candidate and an elector do not hear each other, as far as is known here.
         """
         granting = [name for name in self.electors if name not in self._others and name not in without_state]
         if not self._grants or self.is_in_doubt:
             granting = [name for name in granting if name != self.me]
         needed, few = majority(len(self.electors)), {}
         for node in candidates:
-            count = sum(not misses(node, elector) and not misses(elector, node) for elector in granting)
+            count = sum(not are_apart(node, elector) for elector in granting)
             if count < needed:
                 few[node] = f"{TOO_FEW_ELECTORS} ({count} of {len(self.electors)})"
         return few | {

@@ -108,7 +108,7 @@ def test_a_document_with_another_length_of_leases_raises_the_number() -> None:
 @pytest.mark.parametrize("change", [*CHANGES[:3], RELET])
 def test_a_change_that_raises_the_number_waits_until_the_one_before_is_settled(change: FleetChange) -> None:
     unsettled = replace(VALUE, settled=False)
-    assert change.fault(unsettled) == "number 3 is not settled"
+    assert change.fault(unsettled) == "number 3 is not settled: a majority of its electors must answer first"
     assert change.apply(unsettled) == unsettled
 
 
@@ -152,7 +152,7 @@ def test_chosen_value_survives_two_changes_that_come_at_once() -> None:
     assert not value_of(world.machine("b")).settled
     machine = world.machine("b")
     change = AddElector(base_revision=value_of(machine).revision, name="d", disk=world.machine("d").disk.id)
-    assert world.change(machine, change) == "number 2 is not settled"
+    assert world.change(machine, change) == "number 2 is not settled: a majority of its electors must answer first"
     world.tell(world.machine("b"), "c")
     world.run("b", "c", "d", for_s=AT_ONCE_S, still=("b",))
     world.tell(world.machine("c"), "d")

@@ -13,6 +13,7 @@ from zsched.core.gateway.shortfall import (
     LAGS_S,
     LONGEST_DOUBT_S,
     SHORT_RATIO,
+    TRUST_S,
     Shortfalls,
     is_short,
     shows_lack,
@@ -121,17 +122,20 @@ def test_a_machine_that_disappoints_whenever_it_is_tried_is_tried_half_as_often_
     assert pauses == [min(DOUBT_S * 2**count, LONGEST_DOUBT_S) for count in range(9)]
 
 
-def test_a_machine_that_has_kept_its_word_for_as_long_as_it_was_doubted_begins_anew() -> None:
+@pytest.mark.parametrize(("kept_s", "for_s"), [(TRUST_S - 10.0, 4 * DOUBT_S), (TRUST_S, 2 * DOUBT_S), (1e4, DOUBT_S)])
+def test_a_machine_that_has_kept_its_word_for_long_is_doubted_for_less(kept_s: float, for_s: float) -> None:
     shortfalls = Shortfalls()
-    noted(shortfalls, of_stuck(), 0.2, now=0.0)
-    assert not is_held(shortfalls, DOUBT_S)
-    noted(shortfalls, of_stuck(), 0.2, now=DOUBT_S)
-    fine = of_stuck(cores=0.8)
-    for step in range(round(2 * DOUBT_S) + 1):
-        noted(shortfalls, fine, 0.1, now=DOUBT_S + 1.0 + step)
-    later = DOUBT_S + 1.0 + 2 * DOUBT_S
+    for at in (0.0, DOUBT_S):  # a minute, then two
+        assert not is_held(shortfalls, at)
+        noted(shortfalls, of_stuck(), 0.2, now=at)
+    fine, start = of_stuck(cores=0.8), 3 * DOUBT_S
+    assert not is_held(shortfalls, start)
+    for step in range(round(kept_s) + 1):
+        noted(shortfalls, fine, 0.1, now=start + step)
+    later = start + kept_s + 1.0
     noted(shortfalls, of_stuck(), 0.2, now=later)
-    assert not is_held(shortfalls, later + DOUBT_S), "as the first time"
+    assert is_held(shortfalls, later + for_s - 1.0)
+    assert not is_held(shortfalls, later + for_s)
 
 
 def test_a_time_in_which_the_task_was_elsewhere_proves_nothing() -> None:
@@ -142,8 +146,9 @@ def test_a_time_in_which_the_task_was_elsewhere_proves_nothing() -> None:
         noted(shortfalls, elsewhere, 0.1, now=1.0 + step)
     assert not is_held(shortfalls, 101.0)
     noted(shortfalls, of_stuck(cores=0.8), 0.1, now=101.0)
-    noted(shortfalls, of_stuck(), 0.2, now=102.0)
-    assert is_held(shortfalls, 102.0 + 1.9 * DOUBT_S)
+    noted(shortfalls, of_stuck(cores=0.8), 0.1, now=3000.0)
+    noted(shortfalls, of_stuck(), 0.2, now=3001.0)
+    assert is_held(shortfalls, 3001.0 + 1.9 * DOUBT_S)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from support.beats import beat_of
 from zsched.config.timing import WAN, WIFI, WIRED
-from zsched.core.membership.peers import LOSS_FACTOR, LOSSY_S, MAX_LAG_FACTOR, Membership
+from zsched.core.membership.peers import LOSS_FACTOR, LOSSY_S, MAX_LAG_FACTOR, NEW_TIMES, Membership
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, PeerState
 
@@ -350,10 +350,11 @@ def test_a_node_misses_another_one_once_it_has_told_so_for_as_long_as_that_may_b
     ear = heard(LARGE)
     ear.beat("b", 0.1, suspects=("a",))
     ear.beat("b", 0.1 + WIFI.confirm_s / 2, suspects=("a",))
-    missed = partial(ear.members.misses, "b", "a")
+    missed = partial(ear.members.misses, "b", "a", for_s=WIFI.confirm_s)
+    assert ear.members.misses("b", "a", 0.1, 0.0)
     assert not missed(0.1 + WIFI.confirm_s - 0.01)
     assert missed(0.1 + WIFI.confirm_s)
-    assert not ear.members.misses("a", "b", 0.1 + WIFI.confirm_s), "the other way is another one"
+    assert not ear.members.misses("a", "b", 0.1 + WIFI.confirm_s, 0.0), "the other way is another one"
     ear.beat("b", 0.5)
     ear.beat("b", 0.6, suspects=("a",))
     assert not missed(0.6 + WIFI.confirm_s - 0.01), "it has heard it meanwhile"
@@ -363,10 +364,22 @@ def test_what_this_node_misses_itself_counts_by_the_same_time() -> None:
     ear = heard(LARGE)
     ear.run(0.0, WIFI.suspect_s, ("b", "c"))
     me = "me"
-    assert [ear.members.misses(me, name, WIFI.suspect_s) for name in ("a", "b", me)] == [False] * 3
+    assert [ear.members.misses(me, name, WIFI.suspect_s, 0.0) for name in ("a", "b", me)] == [False] * 3
     ear.members.tick(WIFI.suspect_s)
-    assert ear.members.misses(me, "a", WIFI.suspect_s + WIFI.confirm_s)
-    assert not ear.members.misses("a", "b", 1e6), "who is not heard says nothing"
+    assert not ear.members.misses(me, "a", WIFI.suspect_s + 0.1, WIFI.confirm_s)
+    assert ear.members.misses(me, "a", WIFI.suspect_s + WIFI.confirm_s, WIFI.confirm_s)
+    assert not ear.members.misses("a", "b", 1e6, 0.0), "who is not heard says nothing"
+
+
+def test_a_peer_that_has_just_started_still_misses_whom_it_missed_in_its_life_before() -> None:
+    """It accuses nobody because it is new: an owner whom it does not hear would get its task back for a moment."""
+    ear = heard(LARGE)
+    ear.beat("b", 0.1, suspects=("a",))
+    ear.beat("b", 5.0, incarnation=2)
+    until = 5.0 + NEW_TIMES * WIFI.suspect_s
+    assert ear.members.misses("b", "a", until - 0.1, WIFI.confirm_s)
+    assert not ear.members.misses("b", "a", until, WIFI.confirm_s)
+    assert not ear.members.misses("b", "c", 5.1, 0.0)
 
 
 # --- the token: fast path of a kill ----------------------------------------------------------------------------------
