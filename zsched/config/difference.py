@@ -369,6 +369,11 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     stay = [node.name for node in new.nodes if any(one.name == node.name for one in old.nodes)]
     if _let_in(before, stay) != _let_in(after, stay):
         yield _set(anew, "security", _plain(before), _plain(after))
+    elif come := [label for label in after.revoked if label not in before.revoked]:
+        text = (
+            f"a key that was made out for {', '.join(come)} before lets nobody in"  # whoever it is comes with another
+        )
+        yield replace(AT_ONCE, text=text, paths=("security.revoked",))
     nodes, others = ({node.name: (node.kind, _is_on_streams(node)) for node in fleet.nodes} for fleet in (old, new))
     for name in dict.fromkeys((*others, *nodes)):
         if name not in nodes or name not in others:

@@ -161,7 +161,11 @@ def _check_endpoints(entries: dict[str, Located[Section | None]], out: Collector
                 continue
             owner = taken.setdefault(address, f"{name}'s {kind} session")
             if owner != f"{name}'s {kind} session":
-                out.error(listen.where(kind), f"{endpoint} is already {owner}", "give each session a port of its own")
+                out.error(
+                    listen.where(kind),
+                    f"{endpoint} is already {owner}",
+                    "give each session a port of its own (`zsched invite --address HOST:PORT`)",
+                )
 
 
 # --- links -----------------------------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ def is_quick(scene: Scene) -> Result:
 def judged_lag(node: str, status: Json, beat_s: float, suspect_s: float) -> Result:
     """What the lag of a decision loop means: it beats every ``beat_s``, and is suspect after ``suspect_s``."""
     lag_s = float(status["loop_lag_s"])
-    told = f"{node}: the decision loop lags by up to {1000 * lag_s:.1f} ms of late"
+    told = f"{node}: its decision loop was up to {1000 * lag_s:.1f} ms late in the last half minute"
     told += f", a beat is due every {1000 * beat_s:g} ms"
     fix = f"see what takes the CPU of {node} (top); demand: {{cpu_cores:}} of its tasks; a slower `timing:`"
     if lag_s > suspect_s / 2:

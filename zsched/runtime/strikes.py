@@ -135,7 +135,7 @@ def why_no_cut(fleet: Fleet, me: NodeId) -> str:
     if not ports_of(fleet):
         return "the fleet file names no ports"
     here = [node.name for node in fleet.nodes if node.name != me and node.host and is_here(node.host)]
-    return f"on this machine, too, and linked by no network: {', '.join(here)}" if here else ""
+    return f"{', '.join(here)} on this machine, too: between them there is no network to cut" if here else ""
 
 
 def ports_of(fleet: Fleet) -> tuple[int, ...]:

@@ -22,11 +22,11 @@ from zsched_lab.maps.laser_log import malaga_path
 from zsched_lab.paper.cells import Cell, cells_of, merge_of, world_of
 from zsched_lab.paper.coverage_report import save_coverage
 from zsched_lab.paper.figures import save_all, save_gains, save_panels
-from zsched_lab.paper.matrix import Matrix, collect, undone
+from zsched_lab.paper.matrix import DEFINITIONS, Matrix, collect, read_json, undone
 from zsched_lab.paper.metrics import Truth, brief, measure
 from zsched_lab.paper.places import scenario_path
 from zsched_lab.paper.plan import AROUND_S, leave_out, plan_text, without
-from zsched_lab.paper.published import RESULTS, unpack
+from zsched_lab.paper.published import RESULTS, definitions_of, is_published, made_by, unpack
 from zsched_lab.paper.radio_bench import RADIO_SCHEMES, radio_results, run_radio
 from zsched_lab.paper.report import groups_of, in_block, is_whole, main_level, report
 from zsched_lab.paper.robots import ExploreRobots, LogRobots, Robots, slam_task
@@ -81,6 +81,8 @@ def run_bench(options: BenchOptions) -> int:
 
 
 def _run(options: BenchOptions) -> int:
+    if options.is_report and is_published(options.out):
+        return report_again(options.out)
     scenario, cells, skipped = planned(options)
     inputs = InputsOf(options, scenario)
     body = plan_body(scenario, inputs, cells)
@@ -243,7 +245,7 @@ def claim_folder(options: BenchOptions, body: Mapping[str, Any]) -> str | None:
     """Make the folder this bench's own; returns why it is not to be used."""
     out, plan = options.out, options.out / "plan.json"
     if options.is_report and not plan.exists():
-        return f"--report: there is no run of `zsched bench paper` in {out}; name its folder with --out"
+        return f"--report: there are neither runs of `zsched bench paper` nor a {RESULTS} in {out}; name one with --out"
     if not out.exists() or not any(out.iterdir()):
         out.mkdir(parents=True, exist_ok=True)
         write_json(plan, body)
@@ -270,8 +272,8 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
     runs, invalid = collect(options.out, cells)
     results = {
         "schema": RESULTS_SCHEMA,
-        "version": __version__,
-        "machine": machine_text(),
+        "version": made_by(runs, "version") or __version__,
+        "machine": made_by(runs, "machine") or machine_text(),
         "command": command_of(options),
         "scenario": asdict(scenario) | {"fleet": scenario.fleet.name},
         "input": inputs.name,
@@ -283,19 +285,43 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
         "skipped": rest.skipped,
         "radio": rest.radio,
     }
+    results = json.loads(json.dumps(results))  # as it is read back
     write_json(options.out / RESULTS, results)
-    title = f"{scenario.name}, load {main_level(results)}, seed {scenario.seed}, {inputs.name}"
-    main = in_block(runs, scenario.main)
-    level = main_level(results)
-    drawn = save_all(main, level, tuple(scenario.levels), options.out, title)
-    drawn += block_pictures(results, options.out)
-    (options.out / "report.md").write_text(report(results, drawn), encoding="utf-8")
-    (options.out / "readme.md").write_text(snippet(results, drawn), encoding="utf-8")
     missing = len(cells) - len(runs)
     if missing:
         say(f"{missing} of {len(cells)} runs have no valid result; see {options.out / 'runs'}, then --resume")
-    print(f"{options.out / 'report.md'}: {len(runs)} runs")
+    _write_report(results, options.out)
     return EXIT_FAILED if missing and not options.is_report else 0
+
+
+def report_again(out: Path) -> int:
+    """Report the published ``results.json`` of a folder that holds nothing else, as it is; the exit code."""
+    path = out / RESULTS
+    told = definitions_of(path)
+    if isinstance(told, str):
+        say(f"--report: {path}: {told}")
+        return EXIT_USAGE
+    older = [str(number) for number in told if number != DEFINITIONS]
+    text = f"{path} has figures by definitions {', '.join(older)}, today's are {DEFINITIONS}"
+    if older:
+        say(f"{text}: they stand here as they were (docs/evaluation/README.md)")
+    try:
+        _write_report(read_json(path), out)
+    except KeyError as error:
+        say(f"--report: {text}, and {error} is missing: only the version that made them can report them")
+        return EXIT_USAGE
+    return 0
+
+
+def _write_report(results: Mapping[str, Any], out: Path) -> None:
+    """Write report.md, readme.md and the pictures of these results."""
+    scenario, level = results["scenario"], main_level(results)
+    title = f"{scenario['name']}, load {level}, seed {scenario['seed']}, {results['input']}"
+    drawn = save_all(in_block(results["runs"], scenario["main"]), level, tuple(scenario["levels"]), out, title)
+    drawn += block_pictures(results, out)
+    (out / "report.md").write_text(report(results, drawn), encoding="utf-8")
+    (out / "readme.md").write_text(snippet(results, drawn), encoding="utf-8")
+    print(f"{out / 'report.md'}: {len(results['runs'])} runs")
 
 
 def block_pictures(results: Mapping[str, Any], out: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Fills a new folder with the runs of a results.json, so that a bench goes on where its files are no longer there.
+"""A results.json without the files of its runs: it can be reported, and a bench can go on behind it in a new folder.
 
 Knows: what results.json holds of each run. Does not know: how a bench is run or reported.
 """
@@ -14,6 +14,26 @@ from zsched_lab.paper.matrix import DEFINITIONS, METRICS, read_json
 from zsched_lab.paper.run import write_json
 
 RESULTS = "results.json"
+
+
+def is_published(out: Path) -> bool:
+    """Whether a folder holds a results.json, and no bench was begun in it."""
+    return (out / RESULTS).exists() and not (out / "plan.json").exists()
+
+
+def definitions_of(results: Path) -> tuple[int, ...] | str:
+    """By which definitions the figures of a results.json are, sorted; a text: why it cannot be reported."""
+    try:
+        told = read_json(results)
+        found = sorted({int(run["definitions"]) for run in told["runs"]})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return f"it is no results.json of `zsched bench paper` ({type(error).__name__}: {error})"
+    return tuple(found) or "it has no runs"
+
+
+def made_by(runs: Sequence[Mapping[str, Any]], key: str) -> str:
+    """The versions or machines that made these runs, who reports them aside; empty: the runs do not say."""
+    return ", ".join(sorted({str(run[key]) for run in runs if run.get(key)}))
 
 
 def unpack(out: Path, body: Mapping[str, Any]) -> str | None:

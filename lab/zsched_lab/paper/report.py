@@ -199,7 +199,10 @@ def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
     """What the `RANKED` schemes gain, under its heading; nothing without enough runs."""
     groups = groups_of(results)
     moving: Gains = {
-        (title, name): over(runs, "zsched", (name,)) for title, runs in groups.items() for name in RANKED[1:]
+        (title, name): over(runs, "zsched", (name,))
+        for title, runs in groups.items()
+        for name in SCHEMES
+        if name not in ("zsched", *FIXED_SCHEMES) and any(figures["scheme"] == name for figures in runs)
     }
     parts: list[str] = []
     if table := gains_text(results, RANKED):

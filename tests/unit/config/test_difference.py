@@ -382,6 +382,13 @@ def test_it_is_said_that_daemons_begin_again_where_they_do_and_nowhere_else() ->
     assert seen == {True, False}
 
 
+def test_the_former_key_of_a_node_that_has_left_is_said_to_let_nobody_in() -> None:
+    """It said that nothing notices, of a line that names the node which is just being invited."""
+    assert told(with_("security: {}", "security: {revoked: [robot9]}", SECURED), SECURED) == [
+        ("security.revoked", None, "[robot9]", "a key that was made out for robot9 before lets nobody in")
+    ]
+
+
 def test_nobody_has_to_restart_a_daemon_that_begins_again_by_itself() -> None:
     """One of another kind does not: the file names another node than it is."""
     before = with_(ROBOT1, f"{ROBOT1}\n  robot9: {{kind: robot}}", SECURED)

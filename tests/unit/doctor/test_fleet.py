@@ -143,7 +143,11 @@ def test_electors_without_their_state_or_apart_are_found(tmp_path: Path) -> None
 
 def test_a_slow_loop_and_a_slow_answer_are_found(tmp_path: Path) -> None:
     scene = fleet_scene(tmp_path)
-    assert_finds(run("fleet.lag", planted(scene, "robot2", loop_lag_s=2.0)), FAIL, "robot2: the decision loop lags")
+    assert_finds(
+        run("fleet.lag", planted(scene, "robot2", loop_lag_s=2.0)),
+        FAIL,
+        "robot2: its decision loop was up to 2000.0 ms late",
+    )
     assert run("fleet.timing", replace(scene, answered_s={"robot2": 0.02})).verdict is PASS
     slow = replace(scene, answered_s={"robot2": 0.02, "robot3": 0.2})
     assert_finds(run("fleet.timing", slow), WARN, "robot3, took 200 ms")

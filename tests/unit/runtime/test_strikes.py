@@ -93,6 +93,6 @@ def test_nodes_on_one_machine_cannot_be_cut_apart() -> None:
     assert why_no_cut(apart(), "edge1") == ""
     fleet = apart()
     here = replace(fleet, nodes=(fleet.nodes[0], replace(fleet.nodes[1], host="127.0.0.1")))
-    assert why_no_cut(here, "edge1") == "on this machine, too, and linked by no network: robot1"
+    assert why_no_cut(here, "edge1") == "robot1 on this machine, too: between them there is no network to cut"
     bare = replace(fleet, nodes=tuple(replace(node, listen_control="", listen_data="") for node in fleet.nodes))
     assert why_no_cut(bare, "edge1") == "the fleet file names no ports"

@@ -355,7 +355,7 @@ def test_a_report_of_what_is_done_so_far_runs_nothing(tmp_path: Path, capsys: py
     given = options(out, is_exploring=True, schemes=("zsched",))
     scenario, cells, _ = planned(given)
     assert run_bench(replace(given, is_report=True)) == 2
-    assert "no run of" in capsys.readouterr().err
+    assert "neither runs of" in capsys.readouterr().err
     assert not out.exists()
 
     claim_folder(given, plan_body(scenario, InputsOf(given, scenario), cells))
