@@ -125,3 +125,36 @@ def test_an_elector_whose_state_is_lost_counts_for_nobody() -> None:
     assert working(sim) == "edge1"
     sim.cut(("edge1",), ("base1",))
     assert sim.run_until(lambda: working(sim) == "edge2", 6.0)
+
+
+# --- what robots cannot see, and the owner says ----------------------------------------------------------------------
+
+
+def unseen_by_robots(*edges: str) -> Simulator:
+    """What these edges send reaches neither base1 nor base2, and the robots do not hear base1."""
+    sim = started()
+    sim.cuts.update((edge, name) for edge in edges for name in ELECTORS[:2])
+    sim.cuts.update(("base1", robot) for robot in ROBOTS)
+    return sim
+
+
+def moves(sim: Simulator) -> int:
+    return max(epoch for task, epoch in sim.owners if task == "guard")
+
+
+def test_an_owner_that_says_that_it_rests_is_left_for_one_that_has_not() -> None:
+    sim = unseen_by_robots("edge1")
+    before = moves(sim)
+    assert sim.run_until(lambda: working(sim) == "edge2", 8.0)
+    sim.run(50.0)
+    assert working(sim) == "edge2"
+    assert moves(sim) - before == 1
+
+
+def test_where_every_candidate_rests_the_task_is_tried_elsewhere_ever_more_seldom() -> None:
+    sim = unseen_by_robots("edge1", "edge2")
+    before = moves(sim)
+    sim.run(300.0)
+    assert 2 <= moves(sim) - before <= 6
+    sim.heal()
+    assert sim.run_until(lambda: working(sim) != "", 5.0)

@@ -44,6 +44,7 @@ from zsched.core.route.gaps import StreamGaps
 from zsched.core.route.rates import StreamRates
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.probation import Probation
+from zsched.core.scheduler.rested import Rested
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.scheduler.unseen import Unseen
@@ -56,7 +57,7 @@ from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, Ta
 from zsched.core.values.plan import StreamCount, WorkerRole
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import CLOCK_IN_DOUBT
+from zsched.core.values.words import CLOCK_IN_DOUBT, RESTS
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
@@ -170,7 +171,7 @@ class Stages:
         self.round_trips = RoundTrips(me)
         # SCHEDULER, VOTE
         self.votes = Votes(fleet, me)
-        self.probation, self.unseen = Probation(fleet), Unseen()
+        self.probation, self.unseen, self.rested = Probation(fleet), Unseen(), Rested()
         self.flags = NodeFlags(rank=[node.name for node in fleet.nodes].index(me))
         self.rounds = Rounds(
             fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips, self.flags
@@ -337,6 +338,12 @@ class Stages:
         """{node: why it can hold no lease} of an exclusive task; of any other one nobody needs any."""
         if not self.executors[task].is_leased:
             return {}
+        spec, owner, unfit = self.fleet.task(task), self.registers[task].value.owner, self._leaseless(task, now)
+        there = {self.me, owner, *(name for name, _ in self._heard(spec, now))}
+        return {**unfit, **self.rested.reasons(task, [one for one in spec.candidates if one in there - {*unfit}], now)}
+
+    def _leaseless(self, task: TaskId, now: float) -> Mapping[NodeId, str]:
+        """{node: why it can hold no lease, by beats}."""
         owner, confirm_s, misses = self.registers[task].value.owner, self.fleet.timing.confirm_s, self.membership.misses
 
         def are_apart(node: NodeId, elector: NodeId) -> bool:
@@ -356,20 +363,27 @@ class Stages:
             since = max(self.tenure.leased_at.get(task, -math.inf), self.rounds.tasks[task].settled_at)
             if task in leaving:
                 continue
-            if self.executors[task].is_leased and now >= since + self.fleet.timing.suspect_s:
+            if (
+                self.executors[task].is_leased
+                and now >= since + self.fleet.timing.suspect_s + self.fleet.timing.lease_s
+            ):
                 why = self.unfit(task, now).get(self.me, "no majority of the electors grants one")
                 why = CLOCK_IN_DOUBT if leases.is_in_doubt else why
-                found[task] = f"it rests, for it has no lease ({why})"
+                found[task] = f"{RESTS} ({why})"
         return found
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
+        owner = self.values()[spec.name].owner
+        told = None if owner is None else self.gateway.fresh(owner, now)
+        if told is not None and self.executors[spec.name].is_leased:
+            self.rested.hear(spec.name, told, now, is_explained=owner in self._leaseless(spec.name, now))
         unfit = self.unfit(spec.name, now)
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)
         left = frozenset(self.flags.drained)
-        if self.rounds.tasks[spec.name].judge.is_overdue(now) and (owner := self.values()[spec.name].owner) is not None:
+        if owner is not None and self.rounds.tasks[spec.name].judge.is_overdue(now):
             left |= {owner}
         if not in_grace and not unproven and not unfit and not unseen and not left:
             return NO_DOUBTS

@@ -1313,6 +1313,13 @@ VOTE_BUGS = (
         ("tests/sim/test_lease_reach.py",),
     ),
     _bug(
+        "an owner that says that it rests keeps its task",
+        "zsched.core.scheduler.rested",
+        "return dict.fromkeys(held, HAS_RESTED) if len(held) < len(names) else _NOBODY",
+        "return _NOBODY",
+        ("tests/unit/core/scheduler/test_rested.py", "tests/sim/test_lease_reach.py"),
+    ),
+    _bug(
         "a machine whose worker was stuck once is avoided for good",
         "zsched.core.gateway.shortfall",
         "        if not is_explained:\n",

@@ -14,6 +14,7 @@ import math
 from collections.abc import Container
 from typing import Final
 
+from zsched.core.doubt import Doubt
 from zsched.core.gateway.company import Company, is_full
 from zsched.core.gateway.job_need import JobNeed
 from zsched.core.values.model import NodeId, TaskId
@@ -24,13 +25,6 @@ SHORT_RATIO: Final = 0.9
 """A task that gets a smaller part of its forecast has a shortfall on that machine."""
 LAGS_S: Final = 4.0
 """Time constant of the age that is foretold: jobs' ages are means that follow later than the machine's figures."""
-DOUBT_S: Final = 60.0
-"""A shortfall that no wait for CPU explains is remembered for so long, the first time."""
-LONGEST_DOUBT_S: Final = 3600.0
-TRUST_S: Final = 600.0
-"""A machine that keeps its promises for so long is doubted for half as long the next time."""
-TOLD_S: Final = 5.0
-"""Two figures of one owner are further apart only where it had no figures, or the task was elsewhere."""
 WAITING_RATIO: Final = 0.1
 """A job that waits for a CPU for this share of its time is held up by others."""
 
@@ -55,40 +49,13 @@ class _Shortfall(Struct, frozen=True):
     """By a wait for CPU: it ends with the others' use, and not by time."""
 
 
-class _Doubt(Struct):
-    """For how long a shortfall counts that nothing explains."""
-
-    for_s: float
-    seen_at: float
-    kept_s: float = 0.0
-    """For how long the machine has kept what it promised since then, with the task on it."""
-    kept_at: float = -math.inf
-
-    def is_over(self, now: float) -> bool:
-        """Whether the machine may be tried again."""
-        return now >= self.seen_at + self.for_s
-
-    def see(self, now: float) -> None:
-        """It has happened again: once the machine was tried again, twice as long counts the next time."""
-        if self.is_over(now):
-            halved = self.for_s * 0.5 ** (self.kept_s // TRUST_S)
-            self.for_s = min(max(2 * halved, DOUBT_S), LONGEST_DOUBT_S)
-        self.seen_at, self.kept_s, self.kept_at = now, 0.0, now
-
-    def keep(self, now: float) -> None:
-        """The machine has kept what it promised; a time of which nobody has told anything proves nothing."""
-        if now - self.kept_at <= TOLD_S:
-            self.kept_s += now - self.kept_at
-        self.kept_at = now
-
-
 class Shortfalls:
     """One node's experience of what machines did not keep."""
 
     def __init__(self) -> None:
         self._seen: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._foretold: dict[TaskId, _Foretold] = {}
-        self._doubts: dict[tuple[TaskId, NodeId], _Doubt] = {}
+        self._doubts: dict[tuple[TaskId, NodeId], Doubt] = {}
 
     def note(
         self,
@@ -130,7 +97,7 @@ class Shortfalls:
             return before is not None
         is_explained = _waits(load, profile)
         if not is_explained:
-            self._doubts.setdefault((task, profile.node), _Doubt(DOUBT_S, now)).see(now)
+            self._doubts.setdefault((task, profile.node), Doubt(seen_at=now)).see(now)
         self._seen[task, profile.node] = _Shortfall(share, stretch, company, is_explained)
         return before != self._seen[task, profile.node]
 

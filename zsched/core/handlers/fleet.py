@@ -93,6 +93,7 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
         del node.problems[source]  # the next beats say it again, where it is still so
     node.gateway.adopt(fleet)
     node.probation.adopt(fleet)
+    node.rested.keep({task.name for task in fleet.tasks}, {one.name for one in fleet.nodes})
     node.unseen.adopt({task.name for task in fleet.tasks})
 
 

@@ -19,7 +19,7 @@ from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import WorkerState
-from zsched.core.values.words import TOO_FEW_ELECTORS
+from zsched.core.values.words import HAS_RESTED, TOO_FEW_ELECTORS
 
 FIRST_NEWS: Final = "known from a peer, the first news here"
 """Why a task has its owner, at a node that knew nothing of the task."""
@@ -142,7 +142,7 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     if state is PeerState.GONE or (state is PeerState.SUSPECT and is_escape):
         return True
     profile = node.gateway.fresh(left, now)
-    if is_escape and node.unfit(value.task, now).get(left, "").startswith(TOO_FEW_ELECTORS):
+    if is_escape and node.unfit(value.task, now).get(left, "").startswith((TOO_FEW_ELECTORS, HAS_RESTED)):
         return True  # or it comes back with each of its links' good moments
     return profile is not None and profile.has_failed(value.task)
 

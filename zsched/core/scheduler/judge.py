@@ -23,11 +23,11 @@ from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
 from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
-from zsched.core.values.words import CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, told_of_worker
+from zsched.core.values.words import CLOCK_IN_DOUBT, HAS_RESTED, TOO_FEW_ELECTORS, told_of_worker
 
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
-_LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS)
+_LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, HAS_RESTED)
 """First words of vetoes by which an owner's exclusive worker cannot be at work for long."""
 FORGIVEN_RATIO: Final = 0.1
 """An owner's worker that is ready makes up so much for the time in which it was not."""

@@ -7,13 +7,11 @@ from dataclasses import replace
 import pytest
 
 from support.profiles import load_of, profile_of
+from zsched.core.doubt import DOUBT_S, LONGEST_DOUBT_S, TRUST_S
 from zsched.core.gateway.job_need import JobNeed
 from zsched.core.gateway.shortfall import (
-    DOUBT_S,
     LAGS_S,
-    LONGEST_DOUBT_S,
     SHORT_RATIO,
-    TRUST_S,
     Shortfalls,
     is_short,
     shows_lack,

@@ -1,0 +1,81 @@
+"""Owners that say that they rest: when their word counts, and for how long they are avoided."""
+
+from __future__ import annotations
+
+from support.profiles import load_of, profile_of
+from zsched.core.doubt import DOUBT_S
+from zsched.core.scheduler.rested import SURE_S, Rested
+from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.words import HAS_RESTED, RESTS
+
+EDGES = ("edge1", "edge2")
+
+
+def owner(node: str = "edge1", *, rests: bool = True, state: WorkerState = WorkerState.READY) -> Profile:
+    return profile_of(node, workers=(load_of(state=state, reason=f"{RESTS} (why)" if rests else ""),))
+
+
+def heard(rested: Rested, profile: Profile, start: float, for_s: float, *, is_explained: bool = False) -> float:
+    """The same word each half second; the time of the last."""
+    now = start
+    while now < start + for_s:
+        rested.hear("merge", profile, now, is_explained=is_explained)
+        now += 0.5
+    return now - 0.5
+
+
+def test_a_word_counts_once_it_has_stood_for_a_while_and_then_for_a_minute() -> None:
+    rested = Rested()
+    heard(rested, owner(), 0.0, SURE_S)
+    assert rested.reasons("merge", EDGES, SURE_S) == {}
+    rested.hear("merge", owner(), SURE_S, is_explained=False)
+    assert rested.reasons("merge", EDGES, SURE_S + DOUBT_S - 0.1) == {"edge1": HAS_RESTED}
+    assert rested.reasons("merge", EDGES, SURE_S + DOUBT_S) == {}
+    assert rested.reasons("slam", EDGES, SURE_S) == {}
+
+
+def test_what_beats_explain_an_owner_at_work_and_one_that_is_not_ready_say_nothing() -> None:
+    for profile, is_explained in (
+        (owner(), True),
+        (owner(rests=False), False),
+        (owner(state=WorkerState.STARTING), False),
+        (profile_of("edge1"), False),
+    ):
+        rested = Rested()
+        heard(rested, owner(), 0.0, SURE_S)
+        rested.hear("merge", profile, SURE_S, is_explained=is_explained)
+        now = heard(rested, owner(), SURE_S + 0.5, SURE_S)
+        assert rested.reasons("merge", EDGES, now) == {}, "it has begun anew"
+
+
+def test_another_owner_has_its_own_time() -> None:
+    rested = Rested()
+    heard(rested, owner(), 0.0, SURE_S)
+    now = heard(rested, owner("edge2"), SURE_S, SURE_S)
+    assert rested.reasons("merge", EDGES, now) == {}
+
+
+def test_nobody_is_avoided_where_all_have_rested() -> None:
+    rested = Rested()
+    now = heard(rested, owner(), 0.0, SURE_S + 1.0)
+    assert rested.reasons("merge", ("edge1",), now) == {}
+    now = heard(rested, owner("edge2"), now + 0.5, SURE_S + 1.0)
+    assert rested.reasons("merge", EDGES, now) == {}
+    assert rested.reasons("merge", (*EDGES, "edge3"), now) == dict.fromkeys(EDGES, HAS_RESTED)
+
+
+def test_who_rests_again_after_a_trial_is_avoided_for_twice_as_long() -> None:
+    rested = Rested()
+    now = heard(rested, owner(), 0.0, SURE_S + 1.0) + DOUBT_S
+    assert rested.reasons("merge", EDGES, now) == {}
+    now = heard(rested, owner(), now, SURE_S + 1.0)
+    assert rested.reasons("merge", EDGES, now + 2 * DOUBT_S - 0.1) == {"edge1": HAS_RESTED}
+    assert rested.reasons("merge", EDGES, now + 2 * DOUBT_S) == {}
+
+
+def test_nothing_is_known_of_tasks_and_nodes_that_are_no_more() -> None:
+    for tasks, nodes in (((), EDGES), (("merge",), ("edge2",))):
+        rested = Rested()
+        now = heard(rested, owner(), 0.0, SURE_S + 1.0)
+        rested.keep(tasks, nodes)
+        assert rested.reasons("merge", EDGES, now) == {}
