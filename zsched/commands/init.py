@@ -95,8 +95,10 @@ def create_state(
         warn(_LOST.format(name=name, fleet=fleet.name, file=file, state=path))
     say(f"a core of this machine has speed {core_speed.kept_or_new(state):.2f}")
     if side is not None:
-        text = "the others know it as an elector with another disk: it is a new member, and no elector until"
-        say(f"{path}: blank state of {name} in fleet {fleet.name}; {text} it is added as one")
+        is_known = name in side.electors
+        why = "know it as an elector with another disk" if is_known else "go by an agreed document"
+        text = f"the others {why}: it is a new member, and no elector until it is added as one"
+        say(f"{path}: blank state of {name} in fleet {fleet.name}; {text}")
         return
     say(f"{path}: blank state of {name} in fleet {fleet.name}, generation {generation}")
 

@@ -1294,7 +1294,7 @@ VOTE_BUGS = (
     _bug(
         "each robot asks for a margin, though too few reach the owner",
         STANDING,
-        "allocation.owner is not None and len(told) - _saying(allocation.owner, told, reachable=False) >= needed:",
+        "allocation.owner is not None and (lost_for_s < LOST_S or reaches_owner(spec, allocation, vectors)):",
         "allocation.owner is not None:",
         ("tests/unit/core/scheduler/test_scoring.py",),
     ),

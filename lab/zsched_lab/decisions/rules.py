@@ -120,7 +120,8 @@ class CoreRule:
         if not seats:
             return
         by_service = self.tuning.score is ScoreForm.SERVICE
-        standing = self.view.standing(now, self._allocation if by_service else None)
+        allocation = self._allocation if by_service else None
+        standing = self.view.standing(now, allocation, self._judges[0].lost_for)
         for seat in seats:
             judgement = self._judge(seat, standing, now, is_called=False)
             if judgement.outcome is Outcome.PROPOSE:

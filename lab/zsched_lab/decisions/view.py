@@ -10,6 +10,7 @@ the same smoothing, weights and limits share one `View`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol
 
@@ -17,11 +18,14 @@ from zsched.config.timing import WIFI
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.scoring import score
-from zsched.core.scheduler.standing import Standing, compare
+from zsched.core.scheduler.standing import Standing, compare, reaches_owner
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, UtilityVector
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource
 from zsched_lab.decisions.world import DT_S, MEMORY_MB, World
+
+LostFor = Callable[[bool, float], float]
+"""`Judge.lost_for`: whether the owner is reached and the time now -> for how long it has not been, in seconds."""
 
 START_S: Final = 100.0
 """The clock at step 0: nothing in the core may depend on where a clock begins."""
@@ -50,8 +54,11 @@ class Sight(Protocol):
     def spec(self) -> TaskSpec:
         """The task that it decides about."""
 
-    def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
-        """The joint view of a gather now; ``allocation``: the rule's own, where what a machine is worth hangs on it."""
+    def standing(self, now: float, allocation: Allocation | None = None, lost_for: LostFor | None = None) -> Standing:
+        """The joint view of a gather now.
+
+        ``allocation``: the rule's own, where what a machine is worth hangs on it; ``lost_for`` goes with it.
+        """
 
 
 class Feed:
@@ -113,10 +120,13 @@ class View:
         self._standing: Standing | None = None
         self._version = -1
 
-    def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
+    def standing(self, now: float, allocation: Allocation | None = None, lost_for: LostFor | None = None) -> Standing:
         """The joint view of a gather now; computed again only when a profile has come, or for ``allocation``."""
         if allocation is not None:
-            return compare(self.spec, allocation, self._vectors(allocation, now))
+            vectors = self._vectors(allocation, now)
+            is_reached = reaches_owner(self.spec, allocation, vectors)
+            lost_for_s = math.inf if lost_for is None else lost_for(is_reached, now)
+            return compare(self.spec, allocation, vectors, lost_for_s)
         if self._standing is None or self._version != self.gateway.version:
             self._version = self.gateway.version
             vectors = self.vectors(now)

@@ -340,21 +340,25 @@ def _unknown(side: Sides) -> str:
 
 
 def new_member(me: NodeId, generation: int, answers: Sequence[Snapshot]) -> Sides | None:
-    """The generation that a node with a blank disk comes back into as another member; ``None``: it is not known there.
+    """The generation that a node with a blank disk comes into as another member; ``None``: it begins by its file.
 
-    Its name has a seat by an agreed document, and the fleet lives in one generation. With `NEW_DISK` in its state it
-    cannot answer for that seat, so no vote is given twice.
+    The fleet goes by an agreed document, and lives in one generation. Where the node's name has a seat there, with which
+    it has voted, `NEW_DISK` in its state keeps it from answering for that seat, so no vote is given twice. Where it has
+    none (its seat went with its disk, or it never had one), the electors of its file are none any more: by them it would
+    found a second fleet.
 
     Args:
         me: the node.
         generation: as the operator counts it; 0: not named.
         answers: of the other nodes.
     """
+    agreed = [one for one in answers if one.quorum.number]
     sides = sides_of(answers)
-    if len(sides) != 1 or generation not in (0, sides[0].generation):
+    if not agreed or len(sides) != 1 or generation not in (0, sides[0].generation):
         return None
-    is_known = any(one.quorum.number and me in one.quorum.names and me in one.quorum.voted for one in answers)
-    return sides[0] if is_known else None
+    has_seat = any(me in one.quorum.names for one in agreed)
+    has_voted = any(me in one.quorum.names and me in one.quorum.voted for one in agreed)
+    return sides[0] if has_voted or not has_seat else None
 
 
 def rejoined(

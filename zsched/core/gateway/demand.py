@@ -22,7 +22,7 @@ from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import MAX_CPU_CORES, Profile, Renewal, WorkerLoad, WorkerState
+from zsched.core.values.profile import MAX_CPU_CORES, Jobs, Profile, Renewal, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
 UNSURE = 1.5
@@ -182,7 +182,8 @@ class Demands:
             hz = self._spending[task].answers_hz if task in self._spending else None
             found = _with_heard(found, load, heard, job_cpu_s, hz, speed, is_calm=is_calm)
         else:
-            found = _with_job(found, load, speed, is_new=is_new, is_calm=is_calm)
+            is_known_calm = is_calm and now - found.since > CALM_S
+            found = _with_job(found, load, speed, is_new=is_new, is_calm=is_calm, is_known_calm=is_known_calm)
         self._known[task] = found
         age_s, is_seen = age_of(load.jobs, heard), False
         if not is_new and age_s is not None and found.job is not None and found.work:
@@ -345,7 +346,7 @@ def _with_use(
 ) -> _Known:
     """With the work that its use of ``cores`` shows (`Demands.learn`)."""
     use, most = cores * speed, (load.wanted_cores or 0.0) * speed
-    told, least = _told(load, speed, fastest), max(use, known.work or 0.0)
+    told, least = _told(load, speed, fastest, is_calm=is_calm), max(use, known.work or 0.0)
     is_held = known.is_sure and known.work == least
     if told is not None and not known.is_sure and (most > use or is_new or is_starved):
         return replace(known, work=max(told, known.work or 0.0) if is_new else told)
@@ -353,30 +354,37 @@ def _with_use(
         return replace(known, work=min(UNSURE * use, most), is_sure=False)
     if most > use or is_new or is_starved:
         return replace(known, work=least, is_sure=is_held)
-    is_timed = load.jobs is not None and load.jobs.wait_s is not None
-    if is_calm and is_timed and told is not None and told > use and is_short(load):
-        # its one thread waits for other things, too, so it never always wants to run, and a quicker core would do more;
-        # what a load held up is undone for some seconds behind its end
+    if is_calm and told is not None and told > use and is_short(load):
+        # a worker that waits for other things, too, or whose threads take turns, never always wants to run, and quicker
+        # cores would do more; what a load held up is undone for some seconds behind its end
         return replace(known, work=told, is_sure=False)
     return replace(known, work=use, is_sure=True)
 
 
-def _told(load: WorkerLoad, speed: float, fastest: float) -> float | None:
+def _told(load: WorkerLoad, speed: float, fastest: float, *, is_calm: bool) -> float | None:
     """The work that the task needs, from its use and its worker's report of undone work; ``None``: no report.
 
     Undone work counts only as far as a CPU would have done it. A serial worker that skips four of five camera samples,
     and would skip three of five on the fastest candidate, lacks one of five. Where the kernel reports how long jobs
-    waited for a CPU, that bound is known. Elsewhere only threads that always want to run show a lack.
+    waited for a CPU, that bound is known; of jobs of several threads on a machine with CPU to spare, too (``is_calm``):
+    there no job waits for one. Elsewhere only threads that always want to run show a lack.
     """
     jobs, use = load.jobs, load.cpu_cores
-    if jobs is None or use is None or not shows_lack(load):
+    is_alone = jobs is not None and jobs.wait_s is None and is_calm
+    if jobs is None or use is None or not (is_alone or shows_lack(load)):
         return None
-    undone_hz = jobs.wanted_hz - jobs.done_hz
-    if jobs.wait_s is None:
+    # of jobs that are about as long as the window of their rates, the rates of one moment tell little
+    done_hz = (
+        max(jobs.done_hz, min(use / jobs.cpu_s, 1.0 / jobs.time_s)) if jobs.cpu_s and jobs.time_s else jobs.done_hz
+    )
+    undone_hz = jobs.wanted_hz - done_hz
+    if jobs.wait_s is None and not is_calm:
         return min(use + max(undone_hz, 0.0) * jobs.cpu_s, max(load.wanted_cores or 0.0, use)) * speed
-    alone_s = other_s(jobs) + jobs.cpu_s * speed / fastest
+    working_s = jobs.cpu_s if jobs.wait_s is not None else min(jobs.cpu_s, jobs.time_s)
+    waits_s = other_s(jobs) if jobs.wait_s is not None else jobs.time_s - working_s
+    alone_s = waits_s + working_s * speed / fastest
     if alone_s > 0.0:
-        undone_hz = min(undone_hz, max(1.0 / alone_s - jobs.done_hz, 0.0))
+        undone_hz = min(undone_hz, max(1.0 / alone_s - done_hz, 0.0))
     return max(use + undone_hz * jobs.cpu_s, 0.0) * speed
 
 
@@ -405,14 +413,32 @@ def _with_jobs_work(known: _Known, work_s: float) -> _Most:
     return known.job_work_s.with_one(work_s, known.seen_s)
 
 
-def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is_calm: bool) -> _Known:
+def _threads(load: WorkerLoad, jobs: Jobs) -> float | None:
+    """How many of the worker's threads run or wait for a CPU while it has a job; ``None``: nobody counts them."""
+    busy_ratio = min(jobs.done_hz * jobs.time_s, 1.0)
+    if load.runnable is not None and busy_ratio > 0.0:
+        return max(load.runnable / busy_ratio, load.wanted_cores or 0.0)
+    return load.wanted_cores
+
+
+def _with_job(
+    known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is_calm: bool, is_known_calm: bool
+) -> _Known:
     """With the job of the owner's worker: the one that it reports, or reported before it became silent.
 
     The job of a program that has been replaced says nothing of the one that runs now and reports none.
     """
     is_old = load.renewal is not Renewal.NONE
     if load.jobs is not None:
-        job = told_job(load.jobs, speed, known.job, is_calm=is_calm, used_cores=load.cpu_cores)
+        job = told_job(
+            load.jobs,
+            speed,
+            known.job,
+            is_calm=is_calm,
+            is_known_calm=is_known_calm,
+            used_cores=load.cpu_cores,
+            threads=_threads(load, load.jobs),
+        )
         # a worker that has just come may begin with nothing, and its first jobs be small by that
         is_first = is_new and known.before is not None
         job_work_s = known.job_work_s if is_first else _with_jobs_work(known, load.jobs.cpu_s * speed)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason, short_of_memory
-from zsched.core.scheduler.standing import Standing, compare
+from zsched.core.scheduler.standing import Standing, compare, reaches_owner
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, ScoreForm
@@ -44,7 +44,9 @@ class Decided(Struct, frozen=True, kw_only=True):
 def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
     """Judge by ``figures``; ``judge`` and ``damping`` hold the memory of which the figures have a copy."""
     vectors = {vector.voter: vector for vector in figures.vectors}
-    return decide_by(compare(judge.spec, figures.allocation, vectors), judge, damping, figures)
+    spec, allocation = judge.spec, figures.allocation
+    lost_for_s = judge.lost_for(reaches_owner(spec, allocation, vectors), figures.now)
+    return decide_by(compare(spec, allocation, vectors, lost_for_s), judge, damping, figures)
 
 
 def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figures) -> Decided:

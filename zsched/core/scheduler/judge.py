@@ -69,6 +69,8 @@ class Judge:
     """What of its absences before this one, or before it became ready last, is not forgiven yet."""
     away_until: float | None = None
     """When it became ready last; ``None``: it has always been ready, or is not."""
+    lost_since: float | None = None
+    """Since when the robots do not reach the owner."""
     spent: float = 0.0
     """What staying has cost so far, in utility seconds."""
     spent_at: float | None = None
@@ -92,6 +94,7 @@ class Judge:
         """A vote was lost or the value changed: what staying has cost counts from nothing again."""
         self.unscored_since, self.spent, self.fit_since = None, 0.0, None
         if is_new_owner:
+            self.lost_since = None
             self._forgive()
 
     def _forgive(self) -> None:
@@ -126,6 +129,14 @@ class Judge:
         """What former absences take of an owner's start-up time, in seconds."""
         return max(self.away_s - self.spec.worker.start_deadline_s, 0.0)
 
+    def lost_for(self, is_reached: bool, now: float) -> float:
+        """For how many seconds the robots have not reached the owner."""
+        if is_reached:
+            self.lost_since = None
+            return 0.0
+        self.lost_since = now if self.lost_since is None else self.lost_since
+        return now - self.lost_since
+
     def is_overdue(self, now: float) -> bool:
         """Whether the owner's worker was heard not to be ready for longer than a start may take."""
         since = self.not_ready_since
@@ -139,6 +150,7 @@ class Judge:
             not_ready_since=self.not_ready_since,
             away_s=self.away_s,
             away_until=self.away_until,
+            lost_since=self.lost_since,
             spent=self.spent,
             spent_at=self.spent_at,
             seen_first_at=self.seen_first_at,
@@ -151,7 +163,7 @@ class Judge:
     def recall(self, memory: JudgeMemory) -> None:
         """Remember that, and nothing else."""
         self.unscored_since, self.not_ready_since = memory.unscored_since, memory.not_ready_since
-        self.away_s, self.away_until = memory.away_s, memory.away_until
+        self.away_s, self.away_until, self.lost_since = memory.away_s, memory.away_until, memory.lost_since
         self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
         self.fit_since = memory.fit_since
         self.learnt = LearntPatience()

@@ -6,6 +6,7 @@ Knows: Eq. 5-6, vetoes, penalties. Does not know: how a score is made (`zsched.c
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping
 
@@ -15,6 +16,8 @@ from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utili
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field, replace
 
+LOST_S = 3.0
+"""Where all candidates stand at the limit of their signals, the owner is not reached for a moment now and then."""
 RESOLUTION = 1 / 1024
 """Aggregates are compared to this: half of what a tenth of a machine's free share is worth (0132)."""
 
@@ -39,19 +42,39 @@ class Standing(Struct, frozen=True, kw_only=True):
     """{node: what is held against it}, by the robot that remembers most."""
 
 
-def compare(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> Standing:
+def reaches_owner(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> bool:
+    """Whether the robots reach the task's owner, by the vectors that `compare` counts; false without an owner."""
+    told = _counted(allocation, vectors)
+    if allocation.owner is None:
+        return False
+    # a robot that refuses the owner for something else has not lost it by that
+    return len(told) - _saying(allocation.owner, told, reachable=False) >= _needed(spec, told)
+
+
+def _counted(allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> tuple[UtilityVector, ...]:
+    return tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
+
+
+def _needed(spec: TaskSpec, told: tuple[UtilityVector, ...]) -> int:
+    return len(told) if spec.reach is Reach.ALL else majority(len(told))
+
+
+def compare(
+    spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector], lost_for_s: float = math.inf
+) -> Standing:
     """Join the fresh voters' vectors column by column (Eq. 5-6: argmax over candidates of the aggregate over robots).
 
     Args:
         spec: the task.
         allocation: the current one; vectors under another revision are not counted.
         vectors: {voter: its vector}, the fresh ones only.
+        lost_for_s: for how long the robots have not reached the owner. Less than `LOST_S`, and who is at the limit of
+            its signal is no better place: it would be lost as soon.
     """
-    told = tuple(vectors[voter] for voter in sorted(vectors) if vectors[voter].revision == allocation.revision)
-    needed = len(told) if spec.reach is Reach.ALL else majority(len(told))
+    told = _counted(allocation, vectors)
+    needed = _needed(spec, told)
     fresh = told
-    if allocation.owner is not None and len(told) - _saying(allocation.owner, told, reachable=False) >= needed:
-        # a robot that refuses the owner for something else has not lost it by that
+    if allocation.owner is not None and (lost_for_s < LOST_S or reaches_owner(spec, allocation, vectors)):
         fresh = tuple(_with_margin(vector) for vector in told)
     columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
     reasons: dict[NodeId, str] = {}

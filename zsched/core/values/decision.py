@@ -44,6 +44,7 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
     not_ready_since: float | None = None
     away_s: float = 0.0
     away_until: float | None = None
+    lost_since: float | None = None
     spent: float = 0.0
     spent_at: float | None = None
     seen_first_at: float | None = None

@@ -126,6 +126,13 @@ def objection(
             f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
             f"state it works all the same and votes no more. {again}"
         )
+    named = {one.quorum.generation_id: one for one in answers if one.quorum.number}
+    if len(named) > 1 and not is_forced and not any(node in one.quorum.names for one in named.values()):
+        told = "; ".join(f"{name[:SAID_DIGITS]}: {one.node}" for name, one in sorted(named.items()))
+        return (
+            f"the fleet lives in several generations ({told}), and {node} has a seat in none: "
+            f"`zsched rejoin GENERATION` makes it a new member of one"
+        )
     if newest > generation:
         return (
             f"{current[0].node} says that the fleet lives in generation {newest}; join it with "

@@ -27,7 +27,7 @@ from zsched_lab.decisions.replay import TICKS, rounds
 from zsched_lab.decisions.rules import Move, Rule
 from zsched_lab.decisions.service.history import History, mask_of, rank_of
 from zsched_lab.decisions.service.machines import Machine, Work
-from zsched_lab.decisions.view import IDLE, START_S, Look, Sight
+from zsched_lab.decisions.view import IDLE, START_S, Look, LostFor, Sight
 from zsched_lab.decisions.world import DT_S
 
 WIRED: Final = (LinkSample(source=LinkSource.WIRED),)
@@ -228,9 +228,9 @@ class TaskView:
         self._seen: tuple[int, tuple[NodeId | None, ...]] | None = None
         self._standing: Standing | None = None
 
-    def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
+    def standing(self, now: float, allocation: Allocation | None = None, lost_for: LostFor | None = None) -> Standing:
         """The joint view of a gather now; computed again only when a profile has come or a task has moved."""
-        del allocation  # the scene has it
+        del allocation, lost_for  # the scene has it; on cables everybody is reached
         seen = self.gateway.version, tuple(value.owner for value in self._scene.values.values())
         if self._standing is None or seen != self._seen:
             self._seen, self._standing = seen, self._compare(now)

@@ -348,17 +348,26 @@ def test_a_blank_disk_whose_name_has_a_seat_is_another_member_and_answers_nobody
     assert (state.registers, state.fleet_register) == ((), None)
 
 
+@pytest.mark.parametrize("voted", [(), ("edge1", "robot3")])
+def test_a_blank_disk_whose_name_has_no_seat_founds_no_second_fleet(voted: tuple[str, ...]) -> None:
+    """Its seat went with its disk. By the electors of its file it had a quorum of one, and owned an exclusive task."""
+    side = new_member("edge1", 0, [voter_of("robot1", voted=voted), answer_of("robot2")])
+    assert side is not None
+    file = replace(FLEET, electors=("edge1",))
+    state = rejoined(file, "edge1", None, side, disk="99", incarnation=7, hardware="h", why=NEW_DISK)
+    assert (state.joins, state.lost, state.fleet_register) == (ADOPTED.generation_id, NEW_DISK, None)
+
+
 @pytest.mark.parametrize(
     ("me", "generation", "answers"),
     [
         ("robot3", 0, []),
         ("robot3", 0, [voter_of("robot1", voted=())]),
-        ("edge1", 0, [voter_of("robot1", voted=("edge1", "robot3"))]),
         ("robot3", 1, [voter_of("robot1")]),
         ("robot3", 0, [voter_of("robot1"), voter_of("robot2", replace(ADOPTED, generation_id="ab"))]),
         ("robot3", 0, [voter_of("robot1", FIRST, number=0)]),
     ],
-    ids=["nobody answers", "it never voted", "it has no seat", "another generation", "two halves", "no document"],
+    ids=["nobody answers", "it never voted", "another generation", "two halves", "no document"],
 )
 def test_a_blank_disk_is_a_member_of_one_generation_that_knows_its_name(
     me: str, generation: int, answers: list[Snapshot]

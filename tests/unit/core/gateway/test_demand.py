@@ -289,6 +289,51 @@ def test_a_job_that_also_waits_for_a_disk_lacks_a_quicker_core_on_a_machine_with
     assert alike.at(TASK, slow).cpu_cores == pytest.approx(0.02 / 0.03), "where nobody is quicker it lacks nothing"
 
 
+@pytest.mark.parametrize("wanted", [None, 2.0])
+def test_jobs_of_several_threads_lack_quicker_cores_on_a_machine_with_cpu_to_spare(wanted: float | None) -> None:
+    """Two threads, 0.2 s of CPU a job, nine a second: at speed 1 half of them are skipped, and it stayed there."""
+    jobs = Jobs(time_s=0.2, cpu_s=0.4, done_hz=5.0, wanted_hz=9.0)
+    slow = profile(2.0, cpu=2.1, speed=1.0, wanted=wanted, jobs=jobs)
+    needs = []
+    for fastest in (4.0, 1.5, None):
+        demands = Demands()
+        for look in range(40):
+            demands.learn("merge", slow, look * EVERY_S, fastest=fastest)
+        needs.append(demands.at(TASK, slow).cpu_cores)
+    assert needs == pytest.approx([3.6, 3.0, 2.0]), "as far as the quickest candidate would do them"
+
+
+@pytest.mark.parametrize("done_hz", [0.17, 0.5, 1.08])
+def test_jobs_as_long_as_the_window_of_their_rates_need_no_more_than_their_thread_takes(done_hz: float) -> None:
+    """Its rates swing, its use does not; by the need of one moment the task went round among machines alike."""
+    jobs = Jobs(time_s=1.957, cpu_s=1.957, wait_s=0.0, age_s=2.0, done_hz=done_hz, wanted_hz=1.3)
+    assert learnt(profile(1.0, cpu=1.0, jobs=jobs)).cpu_cores == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("threads", [{"wanted": 4.0}, {"runnable": 2.82}])
+def test_a_job_of_several_threads_that_was_only_seen_under_a_load_is_shared_by_them_elsewhere(
+    threads: dict[str, float],
+) -> None:
+    """Its whole time counted as its work, so an idle machine looked as late as the full one, for good."""
+    jobs = Jobs(time_s=0.3525, cpu_s=0.47, age_s=0.3525, done_hz=2.0, wanted_hz=2.0)
+    load = load_of(cpu_cores=0.94, wanted_cores=threads.get("wanted"), runnable=threads.get("runnable"), jobs=jobs)
+    demands = Demands()
+    for second in range(30):
+        demands.learn("merge", profile_of(cpu_used_cores=4.0, workers=(load,)), float(second))
+    job = demands.job("merge")
+    assert job is not None
+    assert job.work_s == pytest.approx(0.47 / 4.0, rel=0.01)
+    for second in range(30, 60):  # now it is seen alone, and takes 0.2 s
+        alone = replace(jobs, time_s=0.2, age_s=0.2)
+        there = profile_of(cpu_used_cores=1.0, workers=(replace(load, jobs=alone),))
+        demands.learn("merge", there, float(second))
+    for second in range(60, 90):
+        demands.learn("merge", profile_of(cpu_used_cores=4.0, workers=(load,)), float(second))
+    job = demands.job("merge")
+    assert job is not None
+    assert job.work_s == pytest.approx(0.2), "what was seen counts more than what was guessed"
+
+
 def test_what_several_threads_leave_undone_counts_where_they_always_want_to_run() -> None:
     jobs = Jobs(time_s=0.5, cpu_s=1.0, done_hz=2.0, wanted_hz=4.0)
     assert learnt(profile(2.0, cpu=4.0, wanted=8.0, jobs=jobs)).cpu_cores == pytest.approx(4.0)

@@ -226,6 +226,22 @@ def test_what_is_held_against_a_worker_is_part_of_the_memory() -> None:
     assert other.not_ready_for(starting, 47.0) == judge.not_ready_for(starting, 47.0) > 14.0
 
 
+def test_for_how_long_the_owner_is_not_reached_begins_anew_with_each_time_and_each_owner() -> None:
+    judge, other = Judge(spec=SPEC), Judge(spec=SPEC)
+    assert [judge.lost_for(is_reached, now) for is_reached, now in ((True, 0.0), (False, 1.0), (False, 2.5))] == [
+        0,
+        0,
+        1.5,
+    ]
+    other.recall(judge.memory())
+    assert other.lost_for(False, 3.0) == 2.0
+    assert [judge.lost_for(is_reached, now) for is_reached, now in ((True, 3.0), (False, 4.0))] == [0, 0]
+    judge.reset()
+    assert judge.lost_for(False, 5.0) == 1.0
+    judge.reset(is_new_owner=True)
+    assert judge.lost_for(False, 6.0) == 0.0
+
+
 @pytest.mark.parametrize("patience", [0.0, 0.1, 1000.0])
 def test_an_owner_that_cannot_be_scored_is_left_after_a_while_whatever_the_patience(patience: float) -> None:
     """Nobody knows what staying costs there: for an account that never fills it would stay for ever."""

@@ -13,7 +13,7 @@ from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, score
-from zsched.core.scheduler.standing import compare, pick
+from zsched.core.scheduler.standing import LOST_S, compare, pick, reaches_owner
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (
@@ -321,6 +321,17 @@ def test_the_margin_hangs_on_whether_the_robots_reach_the_owner_and_not_on_one_o
     standing = compare(spec, agreed, vectors)
     assert ("edge2" in standing.aggregates) is can_have_it
     assert standing.vetoed.get("edge2", "") == why
+
+
+def test_an_owner_that_is_lost_for_a_moment_is_not_left_for_a_machine_at_the_limit() -> None:
+    """Where all stood at the limit the task fled round without end: 84 moves in 150 s among three machines."""
+    agreed = replace(allocation(), tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
+    edges = (profile("edge1", links=radio(-81.0)), profile("edge2", links=radio(-79.0)), profile("edge3"))
+    vectors = {ROBOT.node: scored(ROBOT, *edges, agreed=agreed)}
+    assert not reaches_owner(SPEC, agreed, vectors)
+    assert compare(SPEC, agreed, vectors, LOST_S - 0.1).aggregates.keys() == {"edge3"}, "which is clearly reached"
+    assert compare(SPEC, agreed, vectors, LOST_S).aggregates.keys() == {"edge2", "edge3"}
+    assert not reaches_owner(SPEC, replace(agreed, owner=None), vectors)
 
 
 def test_an_owner_that_is_refused_is_not_lost_by_that_to_the_radio() -> None:

@@ -13,7 +13,7 @@ from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import Allocation
 from zsched_lab.decisions import drives, radio
 from zsched_lab.decisions.rules import CoreRule
-from zsched_lab.decisions.view import START_S, Feed, Look, View
+from zsched_lab.decisions.view import START_S, Feed, Look, LostFor, View
 from zsched_lab.decisions.world import DT_S, drives_world
 
 
@@ -129,9 +129,11 @@ def test_the_row_by_service_plays_with_its_own_allocation() -> None:
     asked: list[Allocation | None] = []
 
     class Spy(View):
-        def standing(self, now: float, allocation: Allocation | None = None) -> Standing:
+        def standing(
+            self, now: float, allocation: Allocation | None = None, lost_for: LostFor | None = None
+        ) -> Standing:
             asked.append(allocation)
-            return super().standing(now, allocation)
+            return super().standing(now, allocation, lost_for)
 
     level = np.full(200, -60.0)
     flat = radio.Drive(name="flat", dt_s=0.2, rssi_dbm=level, delay_ms=np.full(200, np.nan))
