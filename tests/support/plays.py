@@ -82,6 +82,10 @@ class Play:
 
     def set_flags(self, *flags: Flag) -> None:
         """Agree a document with these flags, and wait until every node has it."""
+        self.agree(flags)
+        self.settle()
+
+    def agree(self, flags: tuple[Flag, ...] = ()) -> None:
+        """Agree a document of the present fleet, and wait for nothing else."""
         content = self.document(self.fleet, flags)
         assert self.told("robot1", ChangeFleet(document=content)).outcome is CommandOutcome.OK
-        self.settle()

@@ -36,6 +36,8 @@ def replay(file: Path, *, is_json: bool) -> int:
         lines = read_packed(file, MOST_BYTES).splitlines()
     except OSError as error:
         raise CliError(EXIT_USAGE, f"{file}: cannot be read: {error.strerror}") from error
+    if not lines:
+        raise CliError(EXIT_USAGE, f"{file}: it is empty, and no decision log")
     done = 0
     torn: list[int] = []
     for number, line in enumerate(lines, 1):

@@ -459,6 +459,11 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             f"paused by {by(value.pause)}: nothing moves it by itself, and a dead owner is not replaced; "
             f"`zsched resume {task.name}`"
         )
+    if value.pin is not None and value.pin.node not in task.candidates:
+        yield (
+            f"pinned to {value.pin.node}, which is no candidate{' any more' if owner == value.pin.node else ''}: "
+            f"`zsched unpin {task.name}`, or name it in `candidates`"
+        )
     if task.rollout is not None:
         held, first = waiting(node.fleet, task), ", ".join(task.rollout.first)
         wait = "wait" if len(held) > 1 else "waits"

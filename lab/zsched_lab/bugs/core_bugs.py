@@ -120,10 +120,17 @@ REGISTER_BUGS = (
     _bug(
         "an owner that is no candidate any more cannot be learnt",
         BELIEF,
-        "any(node.name == value.owner for node in fleet.nodes)",
-        "value.owner in fleet.task(value.task).candidates",
+        "value.owner is None or value.owner in names",
+        "value.owner is None or value.owner in fleet.task(value.task).candidates",
         _AGREEMENT,
         seed=8008456,
+    ),
+    _bug(
+        "no order is agreed about a task whose owner has left the fleet",
+        BELIEF,
+        "names = {register.value.owner, *(one.owner for one in known), *(",
+        "names = {*(",
+        ("tests/unit/core/vote/test_belief.py", "tests/sim/test_pins_of_the_gone.py"),
     ),
     _bug(
         "promise not persisted",

@@ -97,7 +97,7 @@ RECOVERY_BUGS: tuple[Bug, ...] = (
     _bug(
         "a blank disk comes back into one of two halves by itself",
         RECOVERY,
-        ("    if len(sides) != 1 or generation not in", "    if not sides or generation not in"),
+        ("    if not agreed or len(sides) != 1 or generation not in", "    if not agreed or generation not in"),
         test=f"{_UNIT}test_recovery.py",
     ),
     _bug(

@@ -411,6 +411,8 @@ def test_what_is_no_log_is_refused_with_its_line(tmp_path: Path, line: str) -> N
     assert done.exit_code == EXIT_USAGE
     assert f"{file}:3: no line of a decision log" in done.stderr
     assert run("replay", tmp_path / "nothing").exit_code == EXIT_USAGE
+    (tmp_path / "empty").touch()
+    assert run("replay", tmp_path / "empty").exit_code == EXIT_USAGE
 
 
 @pytest.mark.parametrize("cut", [1, 12, 60, 400])

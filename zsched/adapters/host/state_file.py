@@ -195,9 +195,13 @@ class StateFile:
         try:
             replace_synced(self.path, self.folder / NEW_NAME, encode_state(state))
         except OSError as error:
-            raise AdapterError(
-                f"cannot write {self.path}: {error.strerror}; free or remount the disk (the old state is whole)"
-            ) from error
+            advice = "free or remount the disk (the old state is whole)"
+            if isinstance(error, FileNotFoundError) and not self.folder.exists():
+                advice = (
+                    "the folder is gone, and the state with it: before this daemon is started again, bring what "
+                    "`zsched fleet export` writes on another node as its fleet file, and run `zsched init`"
+                )
+            raise AdapterError(f"cannot write {self.path}: {error.strerror}; {advice}") from error
 
     def last_life(self) -> int:
         """The highest incarnation that was noted in this folder; 0: none."""

@@ -290,7 +290,8 @@ class Pilot:
                 continue
             if not peer.word.disk and not (name == instead and peer.word.may_return):
                 continue
-            is_steady = now - peer.at < course.silence_s and now - peer.since >= STEADY * course.silence_s
+            silence_s = min(course.silence_s, course.suspect_s)  # or it may be gone, and a command have just removed it
+            is_steady = now - peer.at < silence_s and now - peer.since >= STEADY * course.silence_s
             if is_steady and peer.word.is_current:
                 alike = sum(kinds.get(other) is kind for other in kept)
                 found.append((alike, peer.since, name))

@@ -342,10 +342,10 @@ def _unknown(side: Sides) -> str:
 def new_member(me: NodeId, generation: int, answers: Sequence[Snapshot]) -> Sides | None:
     """The generation that a node with a blank disk comes into as another member; ``None``: it begins by its file.
 
-    The fleet goes by an agreed document, and lives in one generation. Where the node's name has a seat there, with which
-    it has voted, `NEW_DISK` in its state keeps it from answering for that seat, so no vote is given twice. Where it has
-    none (its seat went with its disk, or it never had one), the electors of its file are none any more: by them it would
-    found a second fleet.
+    The fleet goes by an agreed document, and lives in one generation. Where the node's name has a seat there, with
+    which it has voted, `NEW_DISK` in its state keeps it from answering for that seat, so no vote is given twice. Where
+    it has none (its seat went with its disk, or it never had one), the electors of its file are none any more: by them
+    it would found a second fleet.
 
     Args:
         me: the node.

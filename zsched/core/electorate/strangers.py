@@ -112,9 +112,9 @@ class Strangers(Struct):
         return {
             f"generation/{node}": (
                 f"{node} counts by another generation of this fleet, {_called(told, self._by.get(told, ''))}; this "
-                f"node by {here}; nothing passes between them. To bring {node} over: `zsched rejoin "
-                f"{ours.generation_id[:SAID_DIGITS]}` there; to bring this node over: `zsched rejoin "
-                f"{told[:SAID_DIGITS]}` here"
+                f"node by {here}; nothing passes between them. The side that has a quorum stays. To bring {node} over: "
+                f"`zsched rejoin {ours.generation_id[:SAID_DIGITS]}` there; only where this side has no quorum, to "
+                f"bring this node over: `zsched rejoin {told[:SAID_DIGITS]}` here"
             )
             for node, (told, _) in sorted(self._heard.items())
         }

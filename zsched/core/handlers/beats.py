@@ -170,7 +170,10 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     if node.renewing.told:
         node.renewing.hear(beat.node, beat.fleet_file, now)
     if beat.fleet_file != node.fleet_file or node.problems:
-        node.set_problem(f"fleet/{beat.node}", node.identity.file_complaint(beat, node.fleet_path))
+        node.set_problem(
+            f"fleet/{beat.node}",
+            node.identity.file_complaint(beat, node.fleet_path, is_agreed=bool(node.agreement.document_hash)),
+        )
     _hear_leases(node, beat, todo, now, is_newest=node.membership.is_newest(beat.node))
 
 

@@ -146,9 +146,17 @@ class Identity(Struct):
         lived_s = (sequence - self._twin[1]) * self.beat_s
         return Verdict.DISPUTE if min(now - self._twin[2], lived_s) >= STAYS_S else Verdict.TWIN
 
-    def file_complaint(self, beat: Beat, path: str = "") -> str | None:
-        """How a peer's fleet file differs from ours, at ``path``; ``None``: it is the same, or the peer names none."""
+    def file_complaint(self, beat: Beat, path: str = "", *, is_agreed: bool = False) -> str | None:
+        """How a peer's fleet file differs from ours, at ``path``; ``None``: it is the same, or the peer names none.
+
+        ``is_agreed``: the fleet goes by an agreed document, and no file counts.
+        """
         if beat.fleet_file in ("", self.fleet_file):
             return None
+        if is_agreed:
+            return (
+                f"{beat.node} does not go by the agreed document that this node goes by ({beat.fleet_file}, here "
+                f"{self.fleet_file}): if that lasts, `zsched status` on that machine says why (its disk may be full)"
+            )
         ours = here(self.fleet_file, path)
         return f"{beat.node} goes by another fleet file ({beat.fleet_file}, {ours}): {ONE_FILE}"

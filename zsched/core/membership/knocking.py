@@ -79,8 +79,9 @@ class Knocking(Struct):
         ours = "the document agreed here" if is_agreed else f"this node's fleet file ({here(self.fleet_file, path)})"
         return (
             f"generation/{name}: {name} counts by another generation of this fleet, {generation[:SAID_DIGITS]}, and "
-            f"{ours} does not name it; nothing passes between them. To bring {name} over: `zsched node add` here, then "
-            f"`zsched rejoin` there; to bring this node over: `zsched rejoin {generation[:SAID_DIGITS]}` here"
+            f"{ours} does not name it; nothing passes between them. The side that has a quorum stays. To bring {name} "
+            f"over: `zsched node add` here, then `zsched rejoin` there; only where this side has no quorum, to bring "
+            f"this node over: `zsched rejoin {generation[:SAID_DIGITS]}` here"
         )
 
 

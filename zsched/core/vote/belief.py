@@ -28,7 +28,9 @@ def is_fit(fleet: Fleet, value: Allocation, register: TaskRegister, start: int =
     """Whether a value that is new here could be true: its owner is a node of the fleet, and it is not far ahead.
 
     The owner need not be a candidate. It may have been one by an earlier file, and a node that could not learn that
-    value could not help to move the task away from it. ``start`` is the first revision of the value's generation.
+    value could not help to move the task away from it. Nor need it be a node any more where it has the task already, as
+    far as is known here: no order that leaves the owner as it is could be agreed, nor what ends the pin that holds the
+    task there. ``start`` is the first revision of the value's generation.
     """
     state = register.state
     accepted = None if state.accepted is None else state.accepted.value
@@ -36,7 +38,8 @@ def is_fit(fleet: Fleet, value: Allocation, register: TaskRegister, start: int =
     if value in known:
         return True
     newest = max([register.value.revision, start, *(one.revision for one in known)])
-    is_known = value.owner is None or any(node.name == value.owner for node in fleet.nodes)
+    names = {register.value.owner, *(one.owner for one in known), *(node.name for node in fleet.nodes)}
+    is_known = value.owner is None or value.owner in names
     return is_known and value.epoch <= value.revision <= newest + MAX_AHEAD
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -225,6 +226,16 @@ def test_a_link_in_the_folder_never_chooses_what_is_written(tmp_path: Path, is_h
     assert not file.path.is_symlink()
     assert victim.read_text() == "somebody else's"
     assert victim.stat().st_uid == os.geteuid()
+
+
+def test_a_folder_that_is_gone_is_no_full_disk(tmp_path: Path) -> None:
+    """It said that the old state is whole, and to start again, which founds nothing good without one."""
+    folder = tmp_path / "gone"
+    with state_file(folder) as file:
+        file.save(STATE)
+        shutil.rmtree(folder)
+        with pytest.raises(AdapterError, match=r"the folder is gone, and the state with it: .*`zsched init`"):
+            file.save(STATE)
 
 
 @pytest.mark.root

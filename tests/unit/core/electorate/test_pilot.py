@@ -275,6 +275,17 @@ def test_a_leaver_is_told_what_it_waits_for_and_why_nobody_follows_the_one_that_
     )
 
 
+def test_a_node_that_may_be_gone_becomes_no_elector() -> None:
+    """An operator had just removed it, for it was dead: it came back in the middle of that command."""
+    ear = Ear(value("ab"), replace(COURSE, suspect_s=2.5))
+    ear.hear("bx", STEADY * T + 1.0)
+    assert ear.wish == "+x/78"
+    ear.hear("b", 4.0)
+    assert ear.wish == "2 electors, 2 alive, 0 to spare"
+    ear.hear("bx", 1.0)
+    assert ear.wish == "+x/78"
+
+
 def test_whom_a_pilot_that_has_just_started_never_heard_is_not_counted_on() -> None:
     """It may be dead: without the leaver the fleet would have no majority any more."""
     ear = Ear(value("abc"), replace(COURSE, leaving=("b",)))

@@ -73,6 +73,14 @@ def test_what_is_known_here_already_fits_whatever_it_is() -> None:
     assert not is_fit(FLEET, old, register(learnt=allocation_of(8)))
 
 
+def test_an_owner_that_has_left_the_fleet_stays_it_until_the_task_moves() -> None:
+    """It was pinned there (hard), and no order was agreed any more: neither its unpin nor new weights."""
+    old = allocation_of(7, "robot9")
+    for known in (register(learnt=old), register(learnt=allocation_of(6), accepted=old)):
+        assert is_fit(FLEET, allocation_of(8, "robot9"), known)
+        assert not is_fit(FLEET, allocation_of(8, "robot8"), known)
+
+
 @pytest.mark.parametrize(
     ("by", "new", "accepted", "is_enough"),
     [
