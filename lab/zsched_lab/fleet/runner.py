@@ -23,7 +23,7 @@ from zsched_lab.fleet.schedule import Injection
 
 CLI = (sys.executable, "-m", "zsched.cli")
 INIT_S = 20.0
-UP_S = 30.0
+UP_S = 90.0
 POLL_S = 0.05
 
 Tree = dict[str, Any]
