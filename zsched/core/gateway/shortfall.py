@@ -138,12 +138,16 @@ class Shortfalls:
 
 def _waits(load: WorkerLoad, profile: Profile) -> bool:
     """Whether a worker waits for CPU; where nobody tells, whether its machine is full."""
-    jobs, use = load.jobs, load.cpu_cores or 0.0
+    jobs = load.jobs
     told_s = None if jobs is None else jobs.wait_s
     if load.wanted_cores is None and told_s is None:
         return is_full(profile)
-    is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
-    return is_hungry or (jobs is not None and told_s is not None and told_s > WAITING_RATIO * jobs.time_s)
+    return _is_hungry(load) or (jobs is not None and told_s is not None and told_s > WAITING_RATIO * jobs.time_s)
+
+
+def _is_hungry(load: WorkerLoad) -> bool:
+    """Whether threads that always want to run use less than they would alone."""
+    return load.wanted_cores is not None and (load.cpu_cores or 0.0) < SHORT_RATIO * load.wanted_cores
 
 
 def is_short(load: WorkerLoad) -> bool:
@@ -151,9 +155,8 @@ def is_short(load: WorkerLoad) -> bool:
 
     Either its threads always want to run and run for less, or it leaves work undone.
     """
-    jobs, use = load.jobs, load.cpu_cores or 0.0
-    is_hungry = load.wanted_cores is not None and use < SHORT_RATIO * load.wanted_cores
-    return is_hungry or (jobs is not None and jobs.done_hz < SHORT_RATIO * jobs.wanted_hz)
+    jobs = load.jobs
+    return _is_hungry(load) or (jobs is not None and jobs.done_hz < SHORT_RATIO * jobs.wanted_hz)
 
 
 def shows_lack(load: WorkerLoad) -> bool:
