@@ -354,19 +354,20 @@ class Stages:
         return self.agreement.leases.unfit(self.fleet.task(task).candidates, self.stateless, are_apart)
 
     def resting(self, now: float) -> Mapping[TaskId, str]:
-        """{exclusive task that this node owns and may not work on: why}, once that lasts."""
+        """{exclusive task that this node owns and may not work on: why}, once that lasts. For every turn.
+
+        Until nobody works without a lease any more, and while another owner waits, it rests for others' sake.
+        """
         leases, found = self.agreement.leases, dict[TaskId, str]()
         if not leases.is_holding:
             return found
         leaving = leases.leaving()
         for task in self.owned():
-            since = max(self.tenure.leased_at.get(task, -math.inf), self.rounds.tasks[task].settled_at)
-            if task in leaving:
+            if not self.registers[task].value.leased or task in leaving:
+                self.tenure.leased_at[task] = now
                 continue
-            if (
-                self.executors[task].is_leased
-                and now >= since + self.fleet.timing.suspect_s + self.fleet.timing.lease_s
-            ):
+            since = max(self.tenure.leased_at.get(task, -math.inf), self.rounds.tasks[task].settled_at)
+            if now >= since + self.fleet.timing.suspect_s + self.fleet.timing.lease_s:
                 why = self.unfit(task, now).get(self.me, "no majority of the electors grants one")
                 why = CLOCK_IN_DOUBT if leases.is_in_doubt else why
                 found[task] = f"{RESTS} ({why})"
@@ -376,7 +377,7 @@ class Stages:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
         owner = self.values()[spec.name].owner
         told = None if owner is None else self.gateway.fresh(owner, now)
-        if told is not None and self.executors[spec.name].is_leased:
+        if told is not None and self.registers[spec.name].value.leased:
             self.rested.hear(spec.name, told, now, is_explained=owner in self._leaseless(spec.name, now))
         unfit = self.unfit(spec.name, now)
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))

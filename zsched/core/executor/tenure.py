@@ -38,7 +38,7 @@ class Tenure:
     voters: tuple[NodeId, ...] = field(init=False)
     """The robots that count: without a majority of them this node is cut off; of the electors, if it alone does."""
     leased_at: dict[TaskId, float] = field(default_factory=dict)
-    """{exclusive task: when this node last held a valid lease of it}."""
+    """{exclusive task: when this node last held a valid lease of it, or needed none}."""
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
