@@ -179,6 +179,20 @@ def test_where_the_kernel_does_not_tell_who_waits_a_full_machine_is_the_cause(ot
     assert is_held(shortfalls, 1e6, left) is is_for_good
 
 
+@pytest.mark.parametrize(("wait_s", "is_for_good"), [(0.0199, False), (0.0201, True)])
+def test_a_tenth_of_a_job_s_time_is_a_wait(wait_s: float, *, is_for_good: bool) -> None:
+    shortfalls = Shortfalls()
+    noted(shortfalls, of_stuck(jobs=replace(STUCK, wait_s=wait_s)), 0.2)
+    assert is_held(shortfalls, 1e6) is is_for_good
+
+
+def test_what_a_wait_explains_stays_while_a_doubt_of_another_time_ends() -> None:
+    shortfalls = Shortfalls()
+    noted(shortfalls, of_stuck(), 0.2, now=0.0)
+    noted(shortfalls, of_stuck(jobs=HELD_UP), 0.2, now=1.0)
+    assert is_held(shortfalls, 1e6)
+
+
 def test_of_a_task_or_a_node_that_is_no_more_nothing_is_remembered() -> None:
     for is_of_task in (True, False):
         shortfalls = Shortfalls()

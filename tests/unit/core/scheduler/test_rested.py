@@ -73,9 +73,33 @@ def test_who_rests_again_after_a_trial_is_avoided_for_twice_as_long() -> None:
     assert rested.reasons("merge", EDGES, now + 2 * DOUBT_S) == {}
 
 
+def test_ten_minutes_at_work_halve_the_time_and_a_rest_that_beats_explain_is_no_work() -> None:
+    for is_explained, for_s in ((False, DOUBT_S), (True, 2 * DOUBT_S)):
+        rested = Rested()
+        now = heard(rested, owner(), 0.0, SURE_S + 1.0) + DOUBT_S
+        now = heard(rested, owner(rests=False), now, 620.0, is_explained=is_explained) + 0.5
+        now = heard(rested, owner(), now, SURE_S + 1.0)
+        assert rested.reasons("merge", EDGES, now + for_s - 0.1) == {"edge1": HAS_RESTED}
+        assert rested.reasons("merge", EDGES, now + for_s) == {}
+
+
+def test_a_worker_that_is_not_ready_proves_nothing() -> None:
+    rested = Rested()
+    now = heard(rested, owner(), 0.0, SURE_S + 1.0) + DOUBT_S
+    now = heard(rested, owner(rests=False, state=WorkerState.STARTING), now, 620.0) + 0.5
+    now = heard(rested, owner(), now, SURE_S + 1.0)
+    assert rested.reasons("merge", EDGES, now + 2 * DOUBT_S - 0.1) == {"edge1": HAS_RESTED}
+
+
 def test_nothing_is_known_of_tasks_and_nodes_that_are_no_more() -> None:
-    for tasks, nodes in (((), EDGES), (("merge",), ("edge2",))):
+    for tasks, nodes, is_known in (((), EDGES, False), (("merge",), ("edge2",), False), (("merge",), EDGES, True)):
         rested = Rested()
         now = heard(rested, owner(), 0.0, SURE_S + 1.0)
         rested.keep(tasks, nodes)
-        assert rested.reasons("merge", EDGES, now) == {}
+        assert bool(rested.reasons("merge", EDGES, now)) is is_known
+        rested.hear("merge", owner(), now + 0.1, is_explained=False)  # who is no more begins anew
+        assert bool(rested.reasons("merge", EDGES, now + 0.1)) is (is_known or bool(tasks))
+
+
+def test_three_seconds_make_a_word_sure() -> None:
+    assert SURE_S == 3.0
