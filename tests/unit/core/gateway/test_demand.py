@@ -303,6 +303,20 @@ def test_jobs_of_several_threads_lack_quicker_cores_on_a_machine_with_cpu_to_spa
     assert needs == pytest.approx([3.6, 3.0, 2.0]), "as far as the quickest candidate would do them"
 
 
+def test_what_jobs_of_several_threads_leave_undone_on_a_full_machine_shows_no_lack_of_quicker_cores() -> None:
+    jobs = Jobs(time_s=0.2, cpu_s=0.4, done_hz=5.0, wanted_hz=9.0)
+    demands = Demands()
+    for look in range(10):
+        demands.learn("merge", profile(2.0, cpu=4.0, speed=1.0, jobs=jobs), look * EVERY_S, fastest=4.0)
+    assert demands.at(TASK, profile(speed=1.0)).cpu_cores == pytest.approx(2.0), "they may wait for a CPU"
+
+
+def test_a_starved_job_s_thread_lacks_though_helpers_beside_it_use_a_lot() -> None:
+    """Three of nine jobs a second are done, 0.1 s of CPU each; the other 0.7 cores are no jobs."""
+    jobs = Jobs(time_s=1 / 3, cpu_s=0.1, wait_s=1 / 3 - 0.1, age_s=0.4, done_hz=3.0, wanted_hz=9.0)
+    assert learnt(profile(1.0, cpu=4.0, wanted=2.0, jobs=jobs)).cpu_cores == pytest.approx(1.6)
+
+
 @pytest.mark.parametrize("done_hz", [0.17, 0.5, 1.08])
 def test_jobs_as_long_as_the_window_of_their_rates_need_no_more_than_their_thread_takes(done_hz: float) -> None:
     """Its rates swing, its use does not; by the need of one moment the task went round among machines alike."""
