@@ -178,9 +178,15 @@ class Machine:
                 self.shell.carry_out(self.node.handle(one, monotonic_s()))
 
     def files(self) -> dict[str, tuple[int, bytes]]:
-        """{file: (when it was written, what is in it)} of the state folder."""
-        found = (path for path in sorted(self.folder.rglob("*")) if path.is_file())
-        return {str(path.relative_to(self.folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in found}
+        """{file: (when it was written, what is in it)} of the state folder.
+
+        A file that is replaced under its final name while it is read is looked for once more.
+        """
+        found = sorted(path for path in self.folder.rglob("*") if path.is_file())
+        try:
+            return {str(path.relative_to(self.folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in found}
+        except FileNotFoundError:
+            return self.files()
 
     def at_rest(self) -> dict[str, tuple[int, bytes]]:
         """The files, once nothing has changed them for a while; no write is under way then, however slow the disk."""
