@@ -338,9 +338,13 @@ class Stages:
         """{node: why it can hold no lease} of an exclusive task; of any other one nobody needs any."""
         if not self.executors[task].is_leased:
             return {}
-        spec, owner, unfit = self.fleet.task(task), self.registers[task].value.owner, self._leaseless(task, now)
-        there = {self.me, owner, *(name for name, _ in self._heard(spec, now))}
-        return {**unfit, **self.rested.reasons(task, [one for one in spec.candidates if one in there - {*unfit}], now)}
+        return self._with_rested(self.fleet.task(task), self._leaseless(task, now), now)
+
+    def _with_rested(self, spec: TaskSpec, leaseless: Mapping[NodeId, str], now: float) -> Mapping[NodeId, str]:
+        """{node: why it can hold no lease}, by beats and by what owners have said."""
+        there = {self.me, self.registers[spec.name].value.owner, *(name for name, _ in self._heard(spec, now))}
+        others = [name for name in spec.candidates if name in there and name not in leaseless]
+        return {**leaseless, **self.rested.reasons(spec.name, others, now)}
 
     def _leaseless(self, task: TaskId, now: float) -> Mapping[NodeId, str]:
         """{node: why it can hold no lease, by beats}."""
@@ -375,11 +379,13 @@ class Stages:
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
-        owner = self.values()[spec.name].owner
+        value, needs_lease = self.registers[spec.name].value, self.executors[spec.name].is_leased
+        owner = value.owner
+        leaseless = self._leaseless(spec.name, now) if needs_lease or value.leased else {}
         told = None if owner is None else self.gateway.fresh(owner, now)
-        if told is not None and self.registers[spec.name].value.leased:
-            self.rested.hear(spec.name, told, now, is_explained=owner in self._leaseless(spec.name, now))
-        unfit = self.unfit(spec.name, now)
+        if told is not None and value.leased:
+            self.rested.hear(spec.name, told, now, is_explained=owner in leaseless)
+        unfit = self._with_rested(spec, leaseless, now) if needs_lease else {}
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         unseen = self.unseen.look(spec, ready, self.probation, now, self.fleet.timing.decide_s)

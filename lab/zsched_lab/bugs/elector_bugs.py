@@ -56,7 +56,7 @@ ELECTOR_BUGS: tuple[Bug, ...] = (
     _bug(
         "electors change on an unsettled value",
         CHANGES,
-        ('return "" if read.settled else f"number', 'return f"" and f"number'),
+        ('return "" if read.settled else', 'return "" if read else'),
     ),
     _bug(
         "the last elector is removed",

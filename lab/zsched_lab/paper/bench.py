@@ -252,7 +252,7 @@ def claim_folder(options: BenchOptions, body: Mapping[str, Any]) -> str | None:
         return None
     if not options.is_resumed and not options.is_report:
         return f"--out {out}: the folder is not empty; name a new one, or go on with --resume"
-    if not plan.exists() and (out / RESULTS).exists():
+    if is_published(out):
         wrong = unpack(out, body)
         if wrong is None:
             write_json(plan, body)
@@ -285,12 +285,11 @@ def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells:
         "skipped": rest.skipped,
         "radio": rest.radio,
     }
-    results = json.loads(json.dumps(results))  # as it is read back
     write_json(options.out / RESULTS, results)
     missing = len(cells) - len(runs)
     if missing:
         say(f"{missing} of {len(cells)} runs have no valid result; see {options.out / 'runs'}, then --resume")
-    _write_report(results, options.out)
+    _write_report(options.out)
     return EXIT_FAILED if missing and not options.is_report else 0
 
 
@@ -306,15 +305,16 @@ def report_again(out: Path) -> int:
     if older:
         say(f"{text}: they stand here as they were (docs/evaluation/README.md)")
     try:
-        _write_report(read_json(path), out)
+        _write_report(out)
     except KeyError as error:
         say(f"--report: {text}, and {error} is missing: only the version that made them can report them")
         return EXIT_USAGE
     return 0
 
 
-def _write_report(results: Mapping[str, Any], out: Path) -> None:
-    """Write report.md, readme.md and the pictures of these results."""
+def _write_report(out: Path) -> None:
+    """Write report.md, readme.md and the pictures of a folder's results.json."""
+    results = read_json(out / RESULTS)
     scenario, level = results["scenario"], main_level(results)
     title = f"{scenario['name']}, load {level}, seed {scenario['seed']}, {results['input']}"
     drawn = save_all(in_block(results["runs"], scenario["main"]), level, tuple(scenario["levels"]), out, title)

@@ -15,8 +15,8 @@ Knows: what this node has heard in beats, what other electors think, the fleet v
 * Two electors are no better than three of which one is gone: so the third goes only when a spare is there. Two never
   become one but by a leave, for a majority of two is both. The last one stays.
 * A leaver is removed once those that are heard without it, within the time in which silence is no suspicion, are a
-  majority of the electors that stay: else whoever is
-  gone is replaced first. A single elector that leaves takes a second one, if one is fit, and goes then.
+  majority of the electors that stay: else whoever is gone is replaced first. A single elector that leaves takes a
+  second one, if one is fit, and goes then.
 * A leaver stays until it has learnt a settled value without it (`may_go`).
 * The aim is an odd number, at most `TARGET`, of robots and edges alike, of those the steadiest.
 * Robots that a majority of the electors has not heard for long are *away*; they are back when it hears them.
@@ -55,11 +55,16 @@ class Course(Struct, frozen=True, kw_only=True, dict=True):
     silence_s: float
     """T: an elector that is not heard for this long is gone (seconds, > 0)."""
     suspect_s: float
-    """An elector that is not heard for this long may be gone: a leave does not count on it (seconds, > 0)."""
+    """A node that is not heard for this long may be gone (seconds, > 0)."""
     away_s: float
     """A robot that is not heard for this long does not vote (seconds, >= ``silence_s``)."""
     leaving: tuple[NodeId, ...] = ()
     """Nodes that an operator takes out of the fleet."""
+
+    @property
+    def fresh_s(self) -> float:
+        """Whoever was heard within this time is surely there: a leave counts on it, and it may become an elector."""
+        return min(self.silence_s, self.suspect_s)
 
     @cached_property
     def names(self) -> tuple[NodeId, ...]:
@@ -235,7 +240,7 @@ class Pilot:
         if leaver is not None:
             if count == 1:
                 return _none(f"{leaver} is the last elector, and stays")
-            staying = [name for name in self._alive(value, course, now, course.suspect_s) if name != leaver]
+            staying = [name for name in self._alive(value, course, now, course.fresh_s) if name != leaver]
             if len(staying) >= majority(count - 1):
                 return _remove(value, leaver, "it leaves")
             told.append(f"{leaver} leaves when {majority(count - 1)} of the other electors are alive")
@@ -262,9 +267,12 @@ class Pilot:
         words = ((name, self._peers[name].word) for name in self._alive(value, course, now) if name != self.me)
         return [(name, word) for name, word in words if word.is_current]
 
-    def _alive(self, value: FleetValue, course: Course, now: float, within_s: float = math.inf) -> list[NodeId]:
-        """The electors that this node hears, itself included; who was never heard is not, however new its seat is."""
-        silence_s, heard = min(course.silence_s, within_s), []
+    def _alive(self, value: FleetValue, course: Course, now: float, within_s: float | None = None) -> list[NodeId]:
+        """The electors that this node hears, itself included; who was never heard is not, however new its seat is.
+
+        ``within_s``: seconds since they were; ``None``: less than the silence after which they are gone.
+        """
+        silence_s, heard = course.silence_s if within_s is None else within_s, []
         for seat in value.electors:
             peer = self._peers.get(seat.name)
             if peer is not None and now - peer.at < silence_s and _answers(seat, peer.word):
@@ -290,8 +298,8 @@ class Pilot:
                 continue
             if not peer.word.disk and not (name == instead and peer.word.may_return):
                 continue
-            silence_s = min(course.silence_s, course.suspect_s)  # or it may be gone, and a command have just removed it
-            is_steady = now - peer.at < silence_s and now - peer.since >= STEADY * course.silence_s
+            # fresh: else it may be gone, and a command have just removed it
+            is_steady = now - peer.at < course.fresh_s and now - peer.since >= STEADY * course.silence_s
             if is_steady and peer.word.is_current:
                 alike = sum(kinds.get(other) is kind for other in kept)
                 found.append((alike, peer.since, name))

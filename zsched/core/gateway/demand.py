@@ -370,18 +370,21 @@ def _told(load: WorkerLoad, speed: float, fastest: float, *, is_calm: bool) -> f
     there no job waits for one. Elsewhere only threads that always want to run show a lack.
     """
     jobs, use = load.jobs, load.cpu_cores
-    is_alone = jobs is not None and jobs.wait_s is None and is_calm
-    if jobs is None or use is None or not (is_alone or shows_lack(load)):
+    if jobs is None or use is None:
         return None
-    # of jobs that are about as long as the window of their rates, the rates of one moment tell little
-    done_hz = (
-        max(jobs.done_hz, min(use / jobs.cpu_s, 1.0 / jobs.time_s)) if jobs.cpu_s and jobs.time_s else jobs.done_hz
-    )
+    done_hz = jobs.done_hz
+    if jobs.cpu_s and jobs.time_s:
+        # of jobs that are about as long as the window of their rates, the rates of one moment tell little
+        done_hz = max(done_hz, min(use / jobs.cpu_s, 1.0 / jobs.time_s))
     undone_hz = jobs.wanted_hz - done_hz
-    if jobs.wait_s is None and not is_calm:
+    working_s, waits_s = jobs.cpu_s, other_s(jobs)
+    if jobs.wait_s is None and is_calm:
+        working_s = min(jobs.cpu_s, jobs.time_s)
+        waits_s = jobs.time_s - working_s
+    elif not shows_lack(load):
+        return None
+    elif jobs.wait_s is None:
         return min(use + max(undone_hz, 0.0) * jobs.cpu_s, max(load.wanted_cores or 0.0, use)) * speed
-    working_s = jobs.cpu_s if jobs.wait_s is not None else min(jobs.cpu_s, jobs.time_s)
-    waits_s = other_s(jobs) if jobs.wait_s is not None else jobs.time_s - working_s
     alone_s = waits_s + working_s * speed / fastest
     if alone_s > 0.0:
         undone_hz = min(undone_hz, max(1.0 / alone_s - done_hz, 0.0))

@@ -103,9 +103,10 @@ class Shortfalls:
 
     def end_doubts(self, task: TaskId, now: float) -> None:
         """Forget what nothing explains and was not seen for long enough."""
-        over = {key for key, doubt in self._doubts.items() if key[0] == task and doubt.is_over(now)}
-        if over:
-            self._seen = {key: one for key, one in self._seen.items() if one.is_explained or key not in over}
+        unexplained = [key for key, one in self._seen.items() if key[0] == task and not one.is_explained]
+        for key in unexplained:
+            if self._doubts[key].is_over(now):
+                del self._seen[key]
 
     def _foretell(self, task: TaskId, node: NodeId, age_s: float, now: float) -> float:
         """The age that jobs' mean age is compared with: this one, or what was foretold of those that ended before.

@@ -34,10 +34,12 @@ class Rested(Struct):
     def hear(self, task: TaskId, owner: Profile, now: float, *, is_explained: bool) -> None:
         """The owner's newest profile; ``is_explained``: beats say why it rests, if it does."""
         load, key = owner.worker(task), (task, owner.node)
-        is_ready = load is not None and load.state is WorkerState.READY
-        if load is None or is_explained or not (is_ready and load.reason.startswith(RESTS)):
+        if load is None or load.state is not WorkerState.READY or is_explained:
             self._since.pop(task, None)
-            if is_ready and not is_explained and key in self._doubts:
+            return
+        if not load.reason.startswith(RESTS):
+            self._since.pop(task, None)
+            if key in self._doubts:
                 self._doubts[key].keep(now)
             return
         node, since = self._since.get(task, (owner.node, now))

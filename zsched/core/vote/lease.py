@@ -27,7 +27,7 @@ own.
 * An echo counts only under the same terms (`lease_terms`): the electors and L of both fleet files. The majority of
   another electorate need not meet the one that granted to this owner's earlier life. A node with other terms gets no
   leased task. Nor does a node that does not hear a majority of the electors, or that they do not hear: its lease
-  ends, and no word of it, or of a robot, would ever say that its worker stands still.
+  would end, and its worker rest for as long as that is so.
 * A node whose clock is in doubt (`zsched.core.vote.clocks`) neither works nor grants, and its beats name other terms.
   Afterwards it begins like an elector, and an owner, that has just started.
 * The worker's own report that it has stopped ends the owner's wait before the lease does, but only once the worker was
