@@ -236,6 +236,18 @@ class Dispatcher:
         if count:
             _log.info("%s: %d samples are not done any more: their robot has given them up", name[0], count)
 
+    def _abandon(self, name: SourceName | None) -> None:
+        """A sample without an answer was in hand when its source was given up: it goes where the rest has gone."""
+        if name is None:
+            return
+        self._debts.forget(name)  # it may have been held back since
+        with self._wake:
+            if name in self._given_up:
+                at, count = self._given_up[name]
+                self._given_up[name] = at, count + 1
+                return
+        self._acks.shed(name)
+
     def _is_taken_back(self, name: SourceName) -> bool:
         """A sample has come of a source that was given up.
 
@@ -405,7 +417,10 @@ class Dispatcher:
     def _process(self, waiting: Waiting) -> None:
         source, sample = waiting.source, waiting.sample
         name = waiting.name if waiting.again is None else waiting.again.name
-        if sample is None or self._is_given_up(name, waiting.again):
+        if sample is None:
+            return
+        if self._is_given_up(name, waiting.again):
+            self._abandon(name)
             return
         began_at = monotonic_s()
         self._has_withheld = False
@@ -420,6 +435,8 @@ class Dispatcher:
         self._dispatch(source, sample, waiting.came_s if again is None else None, replayed=waiting.replayed)
         self._in_hand = None
         if self._is_given_up(name, waiting.again):
+            if self._has_withheld:
+                self._abandon(name)
             return
         held = None if again is None else again.held
         if waiting.name is not None:
@@ -443,14 +460,16 @@ class Dispatcher:
             slot=0 if name is None else self._slots.get(name, 0),
             at=began_at if again is None else again.at,
         )
+        crowded_out: list[Done[Input]] = []
         with self._wake:
-            if self._is_given_up(name, again):
-                return
-            if self._begun != begun:  # it became the owner meanwhile
+            is_given_up = self._is_given_up(name, again)
+            if not is_given_up and self._begun != begun:  # it became the owner meanwhile
                 self._backlog.put_back(done)
-                return
-            given_up = self._backlog.keep(done)
-        for lost in given_up:
+            elif not is_given_up:
+                crowded_out = self._backlog.keep(done)
+        if is_given_up and self._has_withheld:
+            self._abandon(name)
+        for lost in crowded_out:
             if lost.name is not None:
                 self._acks.shed(lost.name)
             if lost.held is not None:

@@ -192,6 +192,20 @@ STREAM_BUGS = (
         (f"{_WORKER}::test_a_name_that_comes_behind_the_first_value_counts_for_it_too",),
     ),
     _bug(
+        "what is in hand when its source is given up is counted nowhere",
+        INPUTS,
+        "self._given_up[name] = at, count + 1",
+        "self._given_up[name] = at, count",
+        (f"{_WORKER}::test_what_was_in_hand_when_a_stranger_gave_its_publisher_up_is_counted",),
+    ),
+    _bug(
+        "an input of a source that was given up holds back what comes behind it",
+        INPUTS,
+        "self._debts.forget(name)  # it may",
+        "pass  # it may",
+        (f"{_WORKER}::test_what_was_in_hand_when_a_stranger_gave_its_publisher_up_is_counted",),
+    ),
+    _bug(
         "a backlog is answered by keys",
         "zsched.worker.backlog",
         "deque(sorted((*self._again, *kept), key=_turn_of))",

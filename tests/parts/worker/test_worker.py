@@ -1119,7 +1119,39 @@ def test_a_stranger_s_word_that_a_publisher_is_given_up_is_taken_back(
     until(lambda: echo.output.withheld == 1, "the backlog")
     relay.give_up()
     until(lambda: echo.worker._dispatcher._given_up, "the forgery")
+    _expect_one_lost_of_two(relay)
 
+
+@pytest.mark.parametrize("when", ["claimed", "processed", "being noted", "noted"])
+def test_what_was_in_hand_when_a_stranger_gave_its_publisher_up_is_counted(
+    relay: Relay, echo: Echo, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """It was dropped in silence, and what came behind it was never acknowledged where it had just been noted."""
+    monkeypatch.setattr(worker_inputs, "GIVE_UP_S", 0.2)
+    relay.open_slot(2)
+    dispatcher, own = echo.worker._dispatcher, relay.publisher.id
+    name = INPUT, str(own.zid), own.eid
+    steps = {"claimed": "_claim", "processed": "_dispatch", "being noted": "_note", "noted": "_note"}
+    step = getattr(dispatcher, steps[when])
+
+    def forge(is_due: bool) -> None:
+        if is_due and not dispatcher._given_up and not relay.outputs:
+            dispatcher._give_up(name, monotonic_s())
+
+    def hooked(*args: Any, **kwargs: Any) -> Any:
+        forge(when == "being noted")
+        found = step(*args, **kwargs)
+        forge(when != "being noted" and (when != "claimed" or found is not None))
+        return found
+
+    with monkeypatch.context() as hooks:
+        hooks.setattr(dispatcher, steps[when], hooked)
+        relay.put(b"a")
+        until(lambda: dispatcher._given_up and not dispatcher._is_busy, "the forgery")
+    _expect_one_lost_of_two(relay)
+
+
+def _expect_one_lost_of_two(relay: Relay) -> None:
     def is_answered() -> bool:
         source = zenoh.SourceInfo(relay.publisher.id, 1)
         relay.publisher.put(b"b", source_info=source)
