@@ -305,6 +305,12 @@ def best_fixed(runs: Sequence[Json], metric: str) -> str | None:
     return max(FIXED_SCHEMES, key=lambda name: sign * statistics.fmean(tables[name][run] for run in common))
 
 
+def single_fixed(runs: Sequence[Json]) -> tuple[str, ...]:
+    """The fixed schemes of a block that was not declared with all of them: there is no mean, and each stands alone."""
+    run = {figures["scheme"] for figures in runs}
+    return () if run.issuperset(FIXED_SCHEMES) else tuple(name for name in FIXED_SCHEMES if name in run)
+
+
 def over_best_fixed(runs: Sequence[Json], scheme: str) -> dict[str, Difference]:
     """{metric: difference} of a scheme to the best fixed one of each figure, where both were run often enough."""
     best = {metric: name for metric in GAINS if (name := best_fixed(runs, metric)) is not None}
@@ -330,7 +336,8 @@ def declared(
 ) -> list[tuple[str, Difference]]:
     """(against whom, difference) of a scheme's coverage on the way, of led robots: as declared before their runs.
 
-    Against the mean of the fixed schemes, the best of them as known afterwards, and every other scheme that was run;
+    Against the mean of the fixed schemes and the best of them as known afterwards, or each of them where not all were
+    run, and every other scheme that was run;
     zsched against ``zsched_slam`` stands with the latter, whose question it is. ``metric``: another figure to compare
     them by.
     """
@@ -339,6 +346,7 @@ def declared(
     others = [name for name in SCHEMES if name not in (*FIXED_SCHEMES, scheme)]
     against: dict[str, tuple[str, ...]] = {"the mean of the fixed schemes": FIXED_SCHEMES}
     against |= {} if best is None else {f"the best fixed one, {best}": (best,)}
+    against |= {name: (name,) for name in single_fixed(own)}
     is_base = not SCHEMES[scheme].moves_slam
     against |= {name: (name,) for name in others if not (is_base and SCHEMES[name].family is Family.OURS)}
     mine = table_of(own, metric, (scheme,))

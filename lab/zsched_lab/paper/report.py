@@ -21,6 +21,7 @@ from zsched_lab.paper.claims import (
     over,
     over_best_fixed,
     shared,
+    single_fixed,
 )
 from zsched_lab.paper.coverage_report import coverage_parts
 from zsched_lab.paper.plan import merge_text
@@ -54,6 +55,7 @@ GAINS_SAY = (
     "Eq. 1 and 2 at every moment.\n"
 )
 MOVING_SAY = "zsched against schemes that move, too, in the runs that both have:\n"
+EACH_SAY = "zsched against each other scheme, in the runs that both have:\n"
 BEST_SAY = "zsched against the best fixed scheme of each figure, which is known only afterwards:\n"
 COUNTED = {6: "six", 9: "nine"}
 RANKED = ("zsched", "dyna_both", "oracle")
@@ -202,7 +204,8 @@ def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
         (title, name): over(runs, "zsched", (name,))
         for title, runs in groups.items()
         for name in SCHEMES
-        if name not in ("zsched", *FIXED_SCHEMES) and any(figures["scheme"] == name for figures in runs)
+        if name in single_fixed(runs)
+        or (name not in ("zsched", *FIXED_SCHEMES) and any(figures["scheme"] == name for figures in runs))
     }
     parts: list[str] = []
     if table := gains_text(results, RANKED):
@@ -210,7 +213,8 @@ def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
         picture = [shown("gains.png")] if "gains.png" in pictures else []
         parts += [GAINS_SAY, table, *picture, BEST_SAY, best]
     if beside := gains_table(("where", "against"), moving):
-        parts += [MOVING_SAY, beside]
+        has_fixed = any(name in FIXED_SCHEMES for _, name in moving)
+        parts += [EACH_SAY if has_fixed else MOVING_SAY, beside]
     return ["## Where placing pays\n", *parts] if parts else []
 
 

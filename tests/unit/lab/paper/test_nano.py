@@ -45,6 +45,8 @@ from zsched_lab.paper.places import robots_scenario_path, scenario_path, shipped
 from zsched_lab.paper.plan import AROUND_S, cell_s, plan_text
 from zsched_lab.paper.remarks import declared_parts
 from zsched_lab.paper.report import (
+    EACH_SAY,
+    MOVING_SAY,
     better_text,
     blocks_parts,
     floors_text,
@@ -565,6 +567,19 @@ def test_the_best_fixed_scheme_stands_beside_the_mean_of_all() -> None:
     assert f"| nano | 3 | {best.text()} |" in text, "against the best one"
     assert GAINS[0] == "coverage_mean"
     assert {"received_mb_s", "throughput_mb_s"} <= set(GAINS)
+
+
+def test_where_not_all_fixed_schemes_were_run_each_stands_alone() -> None:
+    runs = [one for one in the_runs(5) if one["scheme"] not in ("fixed_e2", "fixed_e3")]
+    told = dict(declared(runs))
+    assert list(told) == ["fixed_e1", "dyna_both"]
+    assert told["fixed_e1"].value == pytest.approx(0.67 / 0.52 - 1)
+    text = "\n".join(gains_parts(results_of(runs)))
+    assert EACH_SAY in text
+    assert "| nano | fixed_e1 | 5 | +" in text
+    whole = "\n".join(gains_parts(results_of(the_runs(5))))
+    assert MOVING_SAY in whole
+    assert "| nano | fixed_e1 |" not in whole
 
 
 def test_what_was_declared_of_led_robots_is_printed_and_has_a_verdict_when_all_runs_are_done() -> None:
