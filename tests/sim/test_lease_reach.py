@@ -2,50 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-
 import pytest
 
-from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.events import HoldCommanded, MoveCommanded
 from zsched.core.status import build_snapshot
-from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.messages import Hold, HoldTask, MoveTask
 from zsched.core.values.model import Asked
+from zsched_lab.sim import missed_electors
+from zsched_lab.sim.missed_electors import ELECTORS, ROBOTS, main, moves, play, working
 from zsched_lab.sim.simulator import Simulator
-
-TASK = task_of(
-    "guard",
-    tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-    patience=0.1,
-    worker=WorkerSpec(command=("true",)),
-    candidates=("edge1", "edge2"),
-    exclusive=True,
-)
-ROBOTS = ("robot1", "robot2")
-ELECTORS = ("base1", "base2", "base3")
-NODES = ("edge1", "edge2", *ROBOTS, *ELECTORS)
 
 
 def started(*, cool_down_s: float = 0.0, pinned: bool = False, electors: tuple[str, ...] = ELECTORS) -> Simulator:
-    """A fleet whose owner is edge1."""
-    task = replace(TASK, tuning=replace(TASK.tuning, cool_down_s=cool_down_s))
-    sim = Simulator(fleet=fleet_of(task, of=NODES, electors=electors), seed=1)
-    sim.start(*[name for name in NODES if name != "edge2"])
-    assert sim.run_until(lambda: working(sim) == "edge1", 20.0)
-    sim.start("edge2")
+    """A fleet whose owner is edge1, and has been for a while."""
+    sim = missed_electors.started(cool_down_s=cool_down_s, electors=electors)
     if pinned:
         order = HoldTask(task="guard", hold=Hold.PIN, node="edge1", asked=Asked(by="ada@robot1"))
         sim.deliver(sim.machines["robot1"], HoldCommanded(request=1, command=order))
     sim.run(5.0)
     assert working(sim) == "edge1"
     return sim
-
-
-def working(sim: Simulator) -> str:
-    name, until = sim.working.get("guard", ("", -math.inf))
-    return name if until > sim.now else ""
 
 
 @pytest.mark.parametrize("hold", ["", "pin", "cool-down"])
@@ -138,10 +114,6 @@ def unseen_by_robots(*edges: str) -> Simulator:
     return sim
 
 
-def moves(sim: Simulator) -> int:
-    return max(epoch for task, epoch in sim.owners if task == "guard")
-
-
 def test_an_owner_that_says_that_it_rests_is_left_for_one_that_has_not() -> None:
     sim = unseen_by_robots("edge1")
     before = moves(sim)
@@ -158,3 +130,16 @@ def test_where_every_candidate_rests_the_task_is_tried_elsewhere_ever_more_seldo
     assert 2 <= moves(sim) - before <= 6
     sim.heal()
     assert sim.run_until(lambda: working(sim) != "", 5.0)
+
+
+@pytest.mark.parametrize(("is_busy", "down_s", "most_moves"), [(False, 5.0, 1), (True, 1.6, 12), (True, 5.0, 20)])
+def test_a_link_that_is_down_now_and_then_costs_the_task_little(is_busy: bool, down_s: float, most_moves: int) -> None:
+    """Without a word about electors it stood still for a quarter of the time where the link is down that long."""
+    played = play(down_s, is_busy=is_busy, for_s=200.0)
+    assert played.at_work > (0.94 if is_busy else 0.99)
+    assert 1 <= played.moves <= most_moves
+
+
+def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--down", "0", "--seconds", "20"]) == 0
+    assert capsys.readouterr().out.splitlines()[3:] == ["| alike | 0 | 0 | 100% |", "| busy | 0 | 0 | 100% |"]
