@@ -305,10 +305,14 @@ def best_fixed(runs: Sequence[Json], metric: str) -> str | None:
     return max(FIXED_SCHEMES, key=lambda name: sign * statistics.fmean(tables[name][run] for run in common))
 
 
-def single_fixed(runs: Sequence[Json]) -> tuple[str, ...]:
-    """The fixed schemes of a block that was not declared with all of them: there is no mean, and each stands alone."""
+def one_by_one(runs: Sequence[Json], scheme: str = "zsched") -> tuple[str, ...]:
+    """The schemes that were run and that one is compared with singly.
+
+    The fixed ones stand among them only where not all were run: then they have no mean.
+    """
     run = {figures["scheme"] for figures in runs}
-    return () if run.issuperset(FIXED_SCHEMES) else tuple(name for name in FIXED_SCHEMES if name in run)
+    left_out = {scheme, *(FIXED_SCHEMES if run.issuperset(FIXED_SCHEMES) else ())}
+    return tuple(name for name in SCHEMES if name in run and name not in left_out)
 
 
 def over_best_fixed(runs: Sequence[Json], scheme: str) -> dict[str, Difference]:
@@ -343,12 +347,12 @@ def declared(
     """
     own = led(runs)
     best = best_fixed(own, metric)
-    others = [name for name in SCHEMES if name not in (*FIXED_SCHEMES, scheme)]
     against: dict[str, tuple[str, ...]] = {"the mean of the fixed schemes": FIXED_SCHEMES}
     against |= {} if best is None else {f"the best fixed one, {best}": (best,)}
-    against |= {name: (name,) for name in single_fixed(own)}
     is_base = not SCHEMES[scheme].moves_slam
-    against |= {name: (name,) for name in others if not (is_base and SCHEMES[name].family is Family.OURS)}
+    against |= {
+        name: (name,) for name in one_by_one(own, scheme) if not (is_base and SCHEMES[name].family is Family.OURS)
+    }
     mine = table_of(own, metric, (scheme,))
     found = [(name, difference(mine, table_of(own, metric, schemes))) for name, schemes in against.items()]
     return [(name, one) for name, one in found if one is not None]

@@ -18,10 +18,10 @@ from zsched_lab.paper.claims import (
     compared,
     judged,
     led,
+    one_by_one,
     over,
     over_best_fixed,
     shared,
-    single_fixed,
 )
 from zsched_lab.paper.coverage_report import coverage_parts
 from zsched_lab.paper.plan import merge_text
@@ -201,11 +201,7 @@ def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:
     """What the `RANKED` schemes gain, under its heading; nothing without enough runs."""
     groups = groups_of(results)
     moving: Gains = {
-        (title, name): over(runs, "zsched", (name,))
-        for title, runs in groups.items()
-        for name in SCHEMES
-        if name in single_fixed(runs)
-        or (name not in ("zsched", *FIXED_SCHEMES) and any(figures["scheme"] == name for figures in runs))
+        (title, name): over(runs, "zsched", (name,)) for title, runs in groups.items() for name in one_by_one(runs)
     }
     parts: list[str] = []
     if table := gains_text(results, RANKED):
