@@ -358,20 +358,12 @@ class Stages:
         return self.agreement.leases.unfit(self.fleet.task(task).candidates, self.stateless, are_apart)
 
     def resting(self, now: float) -> Mapping[TaskId, str]:
-        """{exclusive task that this node owns and may not work on: why}, once that lasts. For every turn.
-
-        Until nobody works without a lease any more, and while another owner waits, it rests for others' sake.
-        """
+        """{exclusive task that this node owns and may not work on: why}, once that lasts. For every turn."""
         leases, found = self.agreement.leases, dict[TaskId, str]()
         if not leases.is_holding:
             return found
-        leaving = leases.leaving()
         for task in self.owned():
-            if not self.registers[task].value.leased or task in leaving:
-                self.tenure.leased_at[task] = now
-                continue
-            since = max(self.tenure.leased_at.get(task, -math.inf), self.rounds.tasks[task].settled_at)
-            if now >= since + self.fleet.timing.suspect_s + self.fleet.timing.lease_s:
+            if self.tenure.misses_lease(self.registers[task].value, now):
                 why = self.unfit(task, now).get(self.me, "no majority of the electors grants one")
                 why = CLOCK_IN_DOUBT if leases.is_in_doubt else why
                 found[task] = f"{RESTS} ({why})"

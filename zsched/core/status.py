@@ -499,9 +499,11 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         yield from _no_spare(node, task, owner, now)
     for name in sorted(node.unseen.found.get(task.name, ())):
         if name != owner:  # of the owner the wait is told, below
+            is_seen = node.probation.sees(name, task.name)
+            what = "its token comes and goes here" if is_seen else "our relay does not see its token"
             yield (
-                f"the worker on {name} is ready, and our relay does not see its token: {name} gets nothing for this "
-                f"robot; `zsched ping {name}` tells whether its data session answers here"
+                f"the worker on {name} is ready, and {what}: {name} gets nothing for this robot; "
+                f"`zsched ping {name}` tells whether its data session answers here"
             )
     since = _unready_since(node, executor)
     if is_server_ready and now - since >= UNREADY_SHOWN_S:

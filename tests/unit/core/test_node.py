@@ -1247,7 +1247,7 @@ def test_a_drained_node_is_known_to_keep_nothing() -> None:
 def test_so_is_an_owner_whose_worker_is_not_ready_in_time() -> None:
     node = started(learnt=allocation_of(1, "edge1"))
     (spec,) = FLEET.tasks
-    node.rounds.tasks[spec.name].judge.not_ready_since = 100.0
+    node.rounds.tasks[spec.name].judge.absences.since = 100.0
     start_s = spec.worker.start_deadline_s
     assert node._doubts(spec, 100.0 + start_s).left == frozenset()
     assert node._doubts(spec, 100.1 + start_s).left == {"edge1"}

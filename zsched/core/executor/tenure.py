@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from zsched.core.absence import Absences
 from zsched.core.events import ClockCompared
 from zsched.core.executor.handover import Executor
 from zsched.core.membership.peers import Membership
@@ -37,8 +38,8 @@ class Tenure:
     clock: ClockDoubt = field(default_factory=ClockDoubt)
     voters: tuple[NodeId, ...] = field(init=False)
     """The robots that count: without a majority of them this node is cut off; of the electors, if it alone does."""
-    leased_at: dict[TaskId, float] = field(default_factory=dict)
-    """{exclusive task: when this node last held a valid lease of it, or needed none}."""
+    _absences: dict[TaskId, tuple[int, Absences]] = field(default_factory=dict)
+    """{exclusive task that this node owns: (the epoch, of its valid lease in it)}."""
     _alone_since: dict[TaskId, float] = field(default_factory=dict)
     _local: tuple[TaskId, ...] = field(init=False)
 
@@ -49,7 +50,7 @@ class Tenure:
         """Go by ``fleet``, whose tasks the executors are for already."""
         self.fleet = fleet
         self._note_leased()
-        self.leased_at = {task: at for task, at in self.leased_at.items() if task in self.executors}
+        self._absences = {task: one for task, one in self._absences.items() if task in self.executors}
         self.voters = self.fleet.voters
         self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
         self._alone_since = {task: at for task, at in self._alone_since.items() if task in self._local}
@@ -127,8 +128,6 @@ class Tenure:
             before = executor.role
             if task not in leaving and not self.leases.is_in_doubt:
                 until = self.leases.until(task)
-                if until > now:
-                    self.leased_at[task] = now
                 executor.set_lease(until, todo, now)
                 if executor.role is not before:
                     self.leases.on_given(task, until)
@@ -142,6 +141,21 @@ class Tenure:
             # worker that has stopped already will not say so again.
             if now >= self.leases.given_until(task):
                 todo.must_beat |= self.leases.on_run_out(task, number, now)
+
+    def misses_lease(self, value: Allocation, now: float) -> bool:
+        """Whether the worker of a task that this node owns rests for want of a lease, and has for too long. Each turn.
+
+        Until nobody works without a lease any more, and while another owner waits, it rests for others' sake. A lease
+        that is there now and then is missed as one that is not: absences add up (`zsched.core.absence`).
+        """
+        epoch, absences = self._absences.get(value.task, (value.epoch, Absences()))
+        if epoch != value.epoch:
+            absences = Absences()
+        self._absences[value.task] = value.epoch, absences
+        has_to_rest = not value.leased or value.task in self.leases.leaving()
+        is_away = not has_to_rest and self.leases.until(value.task) <= now
+        limit_s = self.fleet.timing.suspect_s + self.fleet.timing.lease_s
+        return absences.look(is_away, now, limit_s) >= limit_s
 
     # --- isolation ---------------------------------------------------------------------------------------------------
 

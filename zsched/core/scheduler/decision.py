@@ -216,7 +216,7 @@ def _escape(judge: Judge, standing: Standing, figures: Figures) -> str | None:
 
 def _look_ahead(judge: Judge, judgement: Judgement, standing: Standing, figures: Figures) -> Judgement:
     """While an owner whose worker is not ready has its start-up deadline: say that, and when it will be left."""
-    since, allocation = judge.not_ready_since, figures.allocation
+    since, allocation = judge.absences.since, figures.allocation
     if since is None or allocation.owner is None or judgement.outcome is Outcome.PROPOSE:
         return judgement
     has_other = any(name != allocation.owner for name in standing.aggregates)

@@ -15,6 +15,7 @@ from collections.abc import Set as AbstractSet
 from enum import StrEnum
 from typing import Final
 
+from zsched.core.absence import Absences
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
 from zsched.core.scheduler.standing import Standing, joined, pick
@@ -29,8 +30,6 @@ INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
 _LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, HAS_RESTED)
 """First words of vetoes by which an owner's exclusive worker cannot be at work for long."""
-FORGIVEN_RATIO: Final = 0.1
-"""An owner's worker that is ready makes up so much for the time in which it was not."""
 UNSCORED_S = 2.0
 """An owner that cannot be scored is left after this time: nobody knows the cost of staying there."""
 
@@ -61,14 +60,10 @@ class Judge:
     """The memory of one task's stickiness at one robot."""
 
     spec: TaskSpec
-    unscored_since: float | None = None
-    """Since when the owner could not be scored, while somebody else could."""
-    not_ready_since: float | None = None
-    """Since when the owner's worker is not ready; earlier by what former absences take of its time."""
-    away_s: float = 0.0
-    """What of its absences before this one, or before it became ready last, is not forgiven yet."""
-    away_until: float | None = None
-    """When it became ready last; ``None``: it has always been ready, or is not."""
+    unscored: Absences = dataclasses.field(default_factory=Absences)
+    """Of the owner's score, while somebody else could be scored."""
+    absences: Absences = dataclasses.field(default_factory=Absences)
+    """Of the owner's worker that is ready."""
     lost_since: float | None = None
     """Since when the robots do not reach the owner."""
     spent: float = 0.0
@@ -92,42 +87,28 @@ class Judge:
 
     def reset(self, *, is_new_owner: bool = False) -> None:
         """A vote was lost or the value changed: what staying has cost counts from nothing again."""
-        self.unscored_since, self.spent, self.fit_since = None, 0.0, None
+        self.unscored, self.spent, self.fit_since = Absences(), 0.0, None
         if is_new_owner:
             self.lost_since = None
-            self._forgive()
-
-    def _forgive(self) -> None:
-        """Nothing is held against the owner's worker."""
-        self.not_ready_since, self.away_s, self.away_until = None, 0.0, None
+            self.absences = Absences()
 
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
 
-        A worker that is ready now and then, and never for long, would have a start-up time for each absence. So they
-        add up, each for a start-up time at most, and a second in which it is ready forgives `FORGIVEN_RATIO` of one.
-        What is more than one start-up time counts to the next absence: a worker that is started anew on purpose, once
-        or twice, takes nobody's patience.
+        A worker that is started anew on purpose, once or twice, takes nobody's patience; one that is ready now and then
+        is left once its absences are longer than a start-up (`zsched.core.absence`).
         """
         if profile is None:
-            self._forgive()
+            self.absences = Absences()
             return 0.0
         load = profile.worker(self.spec.name)
-        if load is not None and load.state is WorkerState.READY:
-            if self.not_ready_since is not None:
-                self.away_s += min(now - self.not_ready_since - self.held_s, self.spec.worker.start_deadline_s)
-                self.not_ready_since, self.away_until = None, now
-            return 0.0
-        if self.not_ready_since is None:
-            forgiven_s = 0.0 if self.away_until is None else FORGIVEN_RATIO * (now - self.away_until)
-            self.away_s, self.away_until = max(self.away_s - forgiven_s, 0.0), None
-            self.not_ready_since = now - self.held_s
-        return now - self.not_ready_since
+        is_away = load is None or load.state is not WorkerState.READY
+        return self.absences.look(is_away, now, self.spec.worker.start_deadline_s)
 
     @property
     def held_s(self) -> float:
         """What former absences take of an owner's start-up time, in seconds."""
-        return max(self.away_s - self.spec.worker.start_deadline_s, 0.0)
+        return self.absences.held_s(self.spec.worker.start_deadline_s)
 
     def lost_for(self, is_reached: bool, now: float) -> float:
         """For how many seconds the robots have not reached the owner."""
@@ -139,17 +120,19 @@ class Judge:
 
     def is_overdue(self, now: float) -> bool:
         """Whether the owner's worker was heard not to be ready for longer than a start may take."""
-        since = self.not_ready_since
+        since = self.absences.since
         return since is not None and now - since > self.spec.worker.start_deadline_s
 
     def memory(self) -> JudgeMemory:
         """What this judge remembers, as a value."""
         players, watched_at = self.learnt.memory() if self.spec.learns_patience else ((), None)
         return JudgeMemory(
-            unscored_since=self.unscored_since,
-            not_ready_since=self.not_ready_since,
-            away_s=self.away_s,
-            away_until=self.away_until,
+            unscored_since=self.unscored.since,
+            unscored_s=self.unscored.total_s,
+            scored_at=self.unscored.back_at,
+            not_ready_since=self.absences.since,
+            away_s=self.absences.total_s,
+            away_until=self.absences.back_at,
             lost_since=self.lost_since,
             spent=self.spent,
             spent_at=self.spent_at,
@@ -162,8 +145,9 @@ class Judge:
 
     def recall(self, memory: JudgeMemory) -> None:
         """Remember that, and nothing else."""
-        self.unscored_since, self.not_ready_since = memory.unscored_since, memory.not_ready_since
-        self.away_s, self.away_until, self.lost_since = memory.away_s, memory.away_until, memory.lost_since
+        self.lost_since = memory.lost_since
+        self.unscored = Absences(since=memory.unscored_since, total_s=memory.unscored_s, back_at=memory.scored_at)
+        self.absences = Absences(since=memory.not_ready_since, total_s=memory.away_s, back_at=memory.away_until)
         self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
         self.fit_since = memory.fit_since
         self.learnt = LearntPatience()
@@ -215,7 +199,7 @@ class Judge:
         self._watch_home(home in scored and home != owner, now)
         winner = home if home is not None and home in scored else pick(scored, owner)
         if winner is None:
-            self.unscored_since = None
+            self.unscored.look(is_away=False, now=now, limit_s=UNSCORED_S)
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
         if not is_drain:
@@ -246,11 +230,10 @@ class Judge:
 
     def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
         """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`)."""
+        self.unscored.look(owner not in scored, now, UNSCORED_S)
         if owner is None or owner not in scored:
-            self.spent, self.spent_at = 0.0, None
-            self.unscored_since = now if self.unscored_since is None else self.unscored_since
+            self.spent, self.spent_at = 0.0 if owner is None else self.spent, None
             return
-        self.unscored_since = None
         elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
         self.spent = spend(self.spent, max(scored.values()) - scored[owner], self.patience, elapsed_s)
         self.spent_at = now
@@ -293,8 +276,8 @@ class Judge:
         if settled_for_s < tuning.cool_down_s:
             return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
         if owner not in scored:
-            assert self.unscored_since is not None
-            unscored_s = now - self.unscored_since
+            assert self.unscored.since is not None
+            unscored_s = now - self.unscored.since
             for_long = f"{owner} cannot be scored, for {unscored_s:.1f} of {UNSCORED_S:g} s"
             return (Outcome.PROPOSE if unscored_s >= UNSCORED_S else Outcome.WAIT), for_long
         if self.spent < self.patience:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Mapping
 from typing import Final
 
+from zsched.core.absence import Absences
 from zsched.core.doubt import Doubt
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerState
@@ -20,7 +21,7 @@ from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import HAS_RESTED, RESTS
 
 SURE_S: Final = 3.0
-"""An owner's word counts after so long: a lease that electors grant again is told of in less."""
+"""An owner's word counts after so long, in all: a lease that electors grant again is told of in less."""
 _NOBODY: Final[Mapping[NodeId, str]] = {}
 
 
@@ -28,24 +29,24 @@ class Rested(Struct):
     """What one node has heard of owners that rest."""
 
     _doubts: dict[tuple[TaskId, NodeId], Doubt] = field(default_factory=dict)
-    _since: dict[TaskId, tuple[NodeId, float]] = field(default_factory=dict)
-    """{task: (its owner, since when that has said that it rests)}."""
+    _absences: dict[tuple[TaskId, NodeId], Absences] = field(default_factory=dict)
+    """Of owners at work, by their own word, that beats do not explain."""
 
     def hear(self, task: TaskId, owner: Profile, now: float, *, is_explained: bool) -> None:
         """The owner's newest profile; ``is_explained``: beats say why it rests, if it does."""
         load, key = owner.worker(task), (task, owner.node)
-        if load is None or load.state is not WorkerState.READY or is_explained:
-            self._since.pop(task, None)
-            return
-        if not load.reason.startswith(RESTS):
-            self._since.pop(task, None)
-            if key in self._doubts:
-                self._doubts[key].keep(now)
-            return
-        node, since = self._since.get(task, (owner.node, now))
-        self._since[task] = (node, since) if node == owner.node else (owner.node, now)
-        if now >= self._since[task][1] + SURE_S:
+        is_ready = load is not None and load.state is WorkerState.READY and not is_explained
+        rests = is_ready and load is not None and load.reason.startswith(RESTS)
+        for (name, node), others in self._absences.items():
+            if name == task and node != owner.node:  # it is not asked to work
+                others.look(is_away=False, now=now, limit_s=SURE_S)
+        if rests and key not in self._absences:
+            self._absences[key] = Absences()
+        for_s = self._absences[key].look(rests, now, SURE_S) if key in self._absences else 0.0
+        if for_s >= SURE_S:
             self._doubts.setdefault(key, Doubt(seen_at=now)).see(now)
+        elif is_ready and not rests and key in self._doubts:
+            self._doubts[key].keep(now)
 
     def reasons(self, task: TaskId, candidates: Iterable[NodeId], now: float) -> Mapping[NodeId, str]:
         """{candidate that has rested: why it may not have the task}; nobody where all of ``candidates`` have.
@@ -64,4 +65,4 @@ class Rested(Struct):
     def keep(self, tasks: Container[TaskId], nodes: Container[NodeId]) -> None:
         """Know nothing of others."""
         self._doubts = {key: one for key, one in self._doubts.items() if key[0] in tasks and key[1] in nodes}
-        self._since = {task: one for task, one in self._since.items() if task in tasks}
+        self._absences = {key: one for key, one in self._absences.items() if key[0] in tasks and key[1] in nodes}

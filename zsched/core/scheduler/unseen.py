@@ -6,7 +6,9 @@ Knows: whose worker is ready by its node's profile, which workers' tokens our re
 Control and streams travel on ports of their own. Where a firewall lets the one through and not the other, a node beats,
 answers and scores as any other, and no stream reaches its worker. A robot says so when such a worker has been ready and
 unseen for `UNSEEN_S`, while the worker of another candidate is seen: then our own relay's links work, and there is a
-better place. By the task's `reach` such a candidate gets nothing, and an owner is left.
+better place. By the task's `reach` such a candidate gets nothing, and an owner is left. One that is unseen again and
+again has that time in all (`zsched.core.absence`), and does not get the task between two absences either, while
+another one is seen that does not come and go.
 
 Workers that show no token before they own the task say nothing here.
 """
@@ -17,6 +19,7 @@ import math
 from collections.abc import Iterable
 from collections.abc import Set as AbstractSet
 
+from zsched.core.absence import Absences
 from zsched.core.scheduler.probation import Probation, shows_token
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import NodeId, TaskId
@@ -33,21 +36,21 @@ class Unseen(Struct):
 
     found: dict[TaskId, frozenset[NodeId]] = field(default_factory=dict)
     """{task: the candidates that were found so when last looked}."""
-    _since: dict[TaskId, dict[NodeId, float]] = field(default_factory=dict)
-    """{task: {candidate: since when its worker is ready and unseen}}."""
+    _absences: dict[TaskId, dict[NodeId, Absences]] = field(default_factory=dict)
+    """{task: {candidate: of its ready worker's tokens}}."""
     _looked_at: float = -math.inf
     """When last, for any task: all are looked at together."""
 
     def forget(self) -> None:
         """Our relay is another one: it tells anew what it sees."""
-        self._since.clear()
+        self._absences.clear()
         self.found.clear()
 
     def adopt(self, tasks: AbstractSet[TaskId]) -> None:
         """What was known of other tasks is forgotten."""
         for task in [task for task in self.found if task not in tasks]:
             del self.found[task]
-            self._since.pop(task, None)
+            self._absences.pop(task, None)
 
     def look(
         self, spec: TaskSpec, ready: Iterable[NodeId], tokens: Probation, now: float, period_s: float = 0.0
@@ -62,11 +65,17 @@ class Unseen(Struct):
             period_s: the longest time between two looks, while all is well.
         """
         if now - self._looked_at > max(LONGEST_GAP_S, 2.0 * period_s):
-            self._since.clear()
+            self._absences.clear()
         self._looked_at = now
         is_seen = {name: tokens.sees(name, spec.name) for name in ready} if shows_token(spec) else {}
         missed = [name for name, seen in is_seen.items() if not seen] if any(is_seen.values()) else []
-        known = self._since.get(spec.name, {})
-        since = self._since[spec.name] = {name: known.get(name, now) for name in missed}
-        found = self.found[spec.name] = frozenset(name for name, at in since.items() if now - at >= UNSEEN_S)
-        return found
+        absences = self._absences.setdefault(spec.name, {})
+        for name in missed:
+            absences.setdefault(name, Absences())
+        away_s = {name: one.look(name in missed, now, UNSEEN_S) for name, one in absences.items()}
+        comes_and_goes = [name for name in is_seen if name in absences and absences[name].is_held(now, UNSEEN_S)]
+        if all(name in comes_and_goes for name, seen in is_seen.items() if seen):
+            comes_and_goes = []
+        found = {name for name, for_s in away_s.items() if for_s >= UNSEEN_S}.union(comes_and_goes)
+        self.found[spec.name] = frozenset(found)
+        return self.found[spec.name]

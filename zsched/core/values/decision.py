@@ -41,6 +41,8 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
     """The memory that a judgement begins with (`zsched.core.scheduler.judge.Judge`)."""
 
     unscored_since: float | None = None
+    unscored_s: float = 0.0
+    scored_at: float | None = None
     not_ready_since: float | None = None
     away_s: float = 0.0
     away_until: float | None = None

@@ -10,6 +10,7 @@ from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import vector_of
+from zsched.core.absence import Absences
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.judge import (
     INITIAL_SETTLE_S,
@@ -132,12 +133,12 @@ def test_challengers_that_take_turns_do_not_save_the_owner() -> None:
 
 
 def test_after_a_reset_staying_has_cost_nothing() -> None:
-    judge = Judge(spec=SPEC, not_ready_since=0.0)
+    judge = Judge(spec=SPEC, absences=Absences(since=0.0))
     judged(judge, BETTER, 0.0)
     judged(judge, BETTER, 1.9)
     judge.reset()
 
-    assert judge.not_ready_since == 0.0, "a lost vote does not make the owner's worker ready"
+    assert judge.absences.since == 0.0, "a lost vote does not make the owner's worker ready"
     assert judged(judge, BETTER, 3.0).outcome is Outcome.WAIT
     assert judged(judge, BETTER, 3.95).outcome is Outcome.PROPOSE
 
@@ -154,10 +155,10 @@ def test_a_judge_that_is_told_what_to_remember_forgets_what_it_has_learnt() -> N
 
 
 def test_a_new_owner_has_its_own_start_up_time() -> None:
-    judge = Judge(spec=SPEC, not_ready_since=0.0)
+    judge = Judge(spec=SPEC, absences=Absences(since=0.0))
     judge.reset(is_new_owner=True)
 
-    assert judge.not_ready_since is None
+    assert judge.absences.since is None
 
 
 def away(judge: Judge, *turns: tuple[WorkerState, float], start: float = 0.0) -> list[float]:
@@ -262,6 +263,26 @@ def test_an_owner_that_was_scored_in_between_is_given_the_whole_time_again(break
 
     assert judged(judge, {"edge2": 0.1}, UNSCORED_S).outcome is Outcome.WAIT
     assert judged(judge, {"edge2": 0.1}, 2 * UNSCORED_S).outcome is Outcome.PROPOSE
+
+
+def test_an_owner_that_can_be_scored_now_and_then_is_left() -> None:
+    """1.5 s of each 2 s without a score: both accounts began anew each time."""
+    judge, outcomes = Judge(spec=replace(SPEC, patience=1000.0)), list[Outcome]()
+    for step in range(60):
+        outcomes.append(judged(judge, {"edge2": 0.1} if step % 20 < 15 else EQUAL, 0.1 * step).outcome)
+    assert Outcome.PROPOSE not in outcomes[:40]
+    assert Outcome.PROPOSE in outcomes[40:]
+    other = Judge(spec=SPEC)
+    other.recall(judge.memory())
+    assert other.unscored == judge.unscored
+    assert other.unscored.total_s > UNSCORED_S
+
+
+def test_what_staying_has_cost_is_not_forgotten_where_the_owner_is_not_scored_for_a_moment() -> None:
+    judge, outcomes = Judge(spec=replace(SPEC, patience=0.5)), list[Outcome]()
+    for step in range(200):
+        outcomes.append(judged(judge, BETTER if step % 20 else {"edge2": 0.1}, 0.1 * step).outcome)
+    assert outcomes.index(Outcome.PROPOSE) == pytest.approx(100, abs=15), "5 times as long as with a patience of 0.1"
 
 
 def test_a_lead_that_came_before_does_not_count_for_an_owner_that_cannot_be_scored() -> None:

@@ -55,6 +55,25 @@ def test_another_owner_has_its_own_time() -> None:
     assert rested.reasons("merge", EDGES, now) == {}
 
 
+def test_an_owner_that_rests_again_and_again_and_never_for_long_has_rested() -> None:
+    """2.8 s of each 3.5: its time began anew with each lease."""
+    rested, now = Rested(), 0.0
+    for _ in range(2):
+        heard(rested, owner(), now, SURE_S)
+        now = heard(rested, owner(rests=False), now + SURE_S, 0.5) + 0.5
+        assert rested.reasons("merge", EDGES, now) == {}
+    now = heard(rested, owner(), now, SURE_S)
+    assert rested.reasons("merge", EDGES, now) == {"edge1": HAS_RESTED}
+
+
+def test_the_time_in_which_another_one_has_the_task_is_no_rest() -> None:
+    rested = Rested()
+    now = heard(rested, owner(), 0.0, SURE_S)
+    now = heard(rested, owner("edge2", rests=False), now + 0.5, 60.0)
+    now = heard(rested, owner(), now + 0.5, SURE_S)
+    assert rested.reasons("merge", EDGES, now) == {}
+
+
 def test_nobody_is_avoided_where_all_have_rested() -> None:
     rested = Rested()
     now = heard(rested, owner(), 0.0, SURE_S + 1.0)
@@ -98,7 +117,7 @@ def test_nothing_is_known_of_tasks_and_nodes_that_are_no_more() -> None:
         rested.keep(tasks, nodes)
         assert bool(rested.reasons("merge", EDGES, now)) is is_known
         rested.hear("merge", owner(), now + 0.1, is_explained=False)  # who is no more begins anew
-        assert bool(rested.reasons("merge", EDGES, now + 0.1)) is (is_known or bool(tasks))
+        assert bool(rested.reasons("merge", EDGES, now + 0.1)) is is_known
 
 
 def test_three_seconds_make_a_word_sure() -> None:

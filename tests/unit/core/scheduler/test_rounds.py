@@ -738,7 +738,7 @@ def test_while_an_owner_s_worker_is_not_ready_the_decision_says_when_it_will_be_
     load = load_of(state=WorkerState.STARTING, reason="no token yet")
     robot.profiles({}, workers=(load,))
     robot.round()
-    since = robot.task.judge.not_ready_since
+    since = robot.task.judge.absences.since
     assert since is not None
     robot.now = since + 5.0
     robot.profiles({}, workers=(load,))
@@ -843,10 +843,10 @@ def test_a_vote_without_a_quorum_does_not() -> None:
 @pytest.mark.parametrize("is_new_epoch", [True, False])
 def test_a_new_owner_has_all_its_time_to_get_ready_and_new_weights_give_none(is_new_epoch: bool) -> None:
     robot = beaten()
-    robot.task.judge.not_ready_since = 90.0
+    robot.task.judge.absences.since = 90.0
     robot.decider.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
     assert robot.task.judge.spent == 0.0
-    assert robot.task.judge.not_ready_since == (None if is_new_epoch else 90.0)
+    assert robot.task.judge.absences.since == (None if is_new_epoch else 90.0)
 
 
 def test_what_an_operator_has_forgiven_is_told_no_more_though_no_profile_has_come_since() -> None:

@@ -73,6 +73,38 @@ def test_a_token_ends_it_at_once_and_its_end_begins_the_time_anew() -> None:
     assert robot.pass_time(0.01) == {"edge1"}
 
 
+def come_and_go(robot: Robot, times: int, away_s: float = 9.0, there_s: float = 2.0) -> list[set[str]]:
+    """What is found at the end of each time away, and of each time there."""
+    found = []
+    for is_present, for_s in ((False, away_s), (True, there_s)) * times:
+        robot.show("edge1", is_present=is_present)
+        found.append(robot.pass_time(for_s))
+    return found
+
+
+def test_a_token_that_comes_and_goes_is_found_and_held_until_its_absences_are_forgiven() -> None:
+    """11 of each 12 s without a stream: the time began anew with each token, and the owner was never left."""
+    robot = Robot("edge2", "edge1")
+    assert come_and_go(robot, 3) == [set(), set(), set(), {"edge1"}, {"edge1"}, {"edge1"}]
+    assert robot.pass_time(60.0) == {"edge1"}
+    assert robot.pass_time(90.0) == set()
+
+
+def test_while_nobody_else_is_seen_one_that_comes_and_goes_is_as_good_as_any() -> None:
+    robot = Robot("edge2", "edge1")
+    come_and_go(robot, 4)
+    robot.show("edge2", is_present=False)
+    assert robot.look() == set()
+    robot.show("edge2")
+    assert robot.look() == {"edge1"}
+    assert robot.look("edge1") == set()
+
+
+def test_a_token_that_is_away_for_a_moment_now_and_then_is_no_reason() -> None:
+    robot = Robot("edge2", "edge1")
+    assert come_and_go(robot, 20, away_s=4.0, there_s=41.0) == [set()] * 40
+
+
 def test_a_worker_that_is_not_ready_has_no_time_running() -> None:
     robot = Robot("edge2")
     robot.pass_time(UNSEEN_S - 1.0)
