@@ -116,7 +116,7 @@ class Machine:
         wanted = float(math.ceil(needs)) if is_short else None
         runnable = math.ceil(needs) if is_short else takes
         if self.takes_turns and needs > 0.0:
-            takes, runnable = self._in_turns(needs, self.cores - rest)
+            takes, runnable = self._in_turns(needs, self.cores - rest, now)
             is_short, wanted = takes < needs, 1.0 if runnable >= 0.9 else None
         holds = self.task_mb if is_owner else 0.0
         load = load_of(
@@ -148,14 +148,15 @@ class Machine:
         self._done = self._undone = self._now = 0.0
         self._owed_s, self._is_at_work = 0.0, False
 
-    def _in_turns(self, needs: float, free_cores: float) -> tuple[float, float]:
+    def _in_turns(self, needs: float, free_cores: float, now: float) -> tuple[float, float]:
         """(cores in use, threads that run or wait): while it has a job its thread runs at a fair share."""
         assert self.job_s is not None
         assert self.threads is not None
         rate = min(max(free_cores, self.cores / max(self.threads + 1.0, self.cores)), 1.0)
-        cpu_s = self.job_s / self._speed
-        done_hz = min(needs / cpu_s, 1.0 / (self.waits_s + cpu_s / rate))
-        return done_hz * cpu_s, done_hz * cpu_s / rate
+        rubs = self.rub if rate < 1.0 else 1.0
+        cpu_s = self.size(now) * self.job_s / self._speed * rubs
+        takes = min(needs * rubs, cpu_s / (self.waits_s + cpu_s / rate))
+        return takes, takes / rate
 
     def _burst(self, mean_cores: float, most_cores: float) -> float:
         """Cores in use by a worker that does whole jobs, by ``most_cores`` each, and uses so much on the mean."""
@@ -189,7 +190,8 @@ class Machine:
             return
         word = self.told or WorkerJobs(task="merge", incarnation=str(now), at_s=now, done=0, wait_s=0.0, age_s=0.0)
         alone_s = self.size(now) * self.job_s / self._speed
-        cpu_s = alone_s * (self.rub if takes < needs else 1.0)
+        is_full = takes < runnable if self.takes_turns else takes < needs
+        cpu_s = alone_s * (self.rub if is_full else 1.0)
         wanted_hz = needs / alone_s
         done_hz = takes / cpu_s
         before, self._done = int(self._done), self._done + elapsed_s * done_hz
@@ -210,7 +212,7 @@ class Machine:
             skipped=int(self._undone),
             time_s=word.time_s + jobs * (time_s + (self.waits_s if self.takes_turns else 0.0)),
             cpu_s=word.cpu_s + jobs * cpu_s,
-            wait_s=(word.wait_s or 0.0) + jobs * (time_s - cpu_s),
+            wait_s=(word.wait_s or 0.0) + jobs * max(time_s - cpu_s, 0.0),
             age_s=(word.age_s or 0.0) + jobs * (time_s + queue_s + (self.waits_s if self.takes_turns else 0.0)),
         )
 
