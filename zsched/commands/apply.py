@@ -215,7 +215,8 @@ def make_plan(
     status = status_of(door)
     owners = {str(task["name"]): task["owner"] for task in status["tasks"]}
     electors = tuple(name for name, _ in held.electors)
-    changes = difference(old, fleet, (held.text, text), owners, electors)
+    bound = {str(task["name"]) for task in status["tasks"] if (pin := task.get("pin")) is not None and pin["is_hard"]}
+    changes = difference(old, fleet, (held.text, text), owners, electors, bound)
     if not wanted_electors(electors, fleet, text):
         raise CliError(EXIT_FAILED, f"{file}: no elector would be left; keep one of {', '.join(electors)}")
     rollouts = kept_rollouts(held.rollouts, fleet)

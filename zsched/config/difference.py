@@ -10,7 +10,7 @@ another place, as candidates from a label, is a change of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import fields
 from enum import StrEnum
 from typing import Any, Final
@@ -167,6 +167,7 @@ def difference(
     texts: tuple[str, str],
     owners: Mapping[TaskId, NodeId | None] | None = None,
     electors: Sequence[NodeId] = (),
+    bound: Container[TaskId] = (),
 ) -> tuple[Change, ...]:
     """All changes from ``old`` to ``new``, in the order of the new file; what only follows stands behind.
 
@@ -176,12 +177,13 @@ def difference(
         texts: the files of the two.
         owners: the owner of each task now; without them nobody is said to move.
         electors: those that are agreed; none: the old file's.
+        bound: the tasks that are pinned hard, so that their owner keeps them though it is no candidate.
     """
     (before, _), (after, _) = (read_yaml(text.encode()) for text in texts)
     agreed = tuple(sorted(electors)) or old.electors
     wanted = wanted_electors(agreed, new, texts[1])
     elections = (_electors(agreed, wanted),) if agreed != wanted else ()
-    verdicts = (*_in_turns(tuple(_verdicts(old, new, owners or {}))), *elections)
+    verdicts = (*_in_turns(tuple(_verdicts(old, new, owners or {}, bound))), *elections)
     changes: list[Change] = []
     told: set[_Verdict] = set()
     for row in rows(before, after):
@@ -238,10 +240,12 @@ def _joined(path: str, before: str | None, after: str | None, found: list[_Verdi
 # --- the fleets ------------------------------------------------------------------------------------------------------
 
 
-def _verdicts(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) -> Iterator[_Verdict]:
+def _verdicts(
+    old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None], bound: Container[TaskId]
+) -> Iterator[_Verdict]:
     yield from _timing(old, new)
     yield from _nodes(old, new)
-    yield from _tasks(old, new, owners)
+    yield from _tasks(old, new, owners, bound)
     yield from _sessions(old, new)
     if old.seeds != new.seeds:
         text = "every daemon dials them from its next start on"
@@ -455,7 +459,9 @@ def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
         yield replace(AT_ONCE, paths=sources)
 
 
-def _tasks(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) -> Iterator[_Verdict]:
+def _tasks(
+    old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None], bound: Container[TaskId]
+) -> Iterator[_Verdict]:
     before, after = ({task.name: task for task in fleet.tasks} for fleet in (old, new))
     for name in (name for name in after if name not in before):
         text = f"task {name} begins, on one of {', '.join(after[name].candidates)}"
@@ -465,15 +471,20 @@ def _tasks(old: Fleet, new: Fleet, owners: Mapping[TaskId, NodeId | None]) -> It
         yield _Verdict(effect=Effect.TASK, text=text, paths=(f"tasks.{name}",), danger=Danger.REMOVE_TASK, about=name)
     for name, task in before.items():
         if name in after and after[name] != task:
-            yield from _task(task, after[name], (old, new), owners.get(name))
+            yield from _task(task, after[name], (old, new), owners.get(name), is_bound=name in bound)
 
 
-def _task(old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet], owner: NodeId | None) -> Iterator[_Verdict]:
+def _task(
+    old: TaskSpec, new: TaskSpec, fleets: tuple[Fleet, Fleet], owner: NodeId | None, *, is_bound: bool
+) -> Iterator[_Verdict]:
     path = f"tasks.{old.name}"
     if old.candidates != new.candidates:
         verdict = AT_ONCE
         if owner is not None and owner not in new.candidates:
-            verdict = _Verdict(effect=Effect.STREAMS, text=f"{old.name} leaves {owner}: its streams move")
+            text = f"{old.name} leaves {owner}: its streams move"
+            if is_bound:
+                text = f"{old.name} stays on {owner}, where it is pinned hard, until `zsched unpin {old.name}`"
+            verdict = _Verdict(effect=Effect.TASK if is_bound else Effect.STREAMS, text=text)
         yield _set(verdict, f"{path}.candidates", old.candidates, new.candidates)
     yield from _tuning(old, new, path)
     for name, key in _OWN_KEYS.items():

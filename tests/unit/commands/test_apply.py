@@ -51,6 +51,7 @@ class Node:
         self.text, self.revision, self.document = text, 7, "ab12" * 8
         self.states = {"robot1": "alive", "robot2": "alive", "edge1": "alive"}
         self.owner = "robot1"
+        self.pin: Json | None = None
         self.electors = ["edge1", "robot1", "robot2"]
         self.files: dict[str, str] = {}
         self.changes: list[Json] = []
@@ -75,7 +76,7 @@ class Node:
             flags = {name: [{"kind": "drain"}] for name in self.drained}
             nodes = [{"name": one, "state": self.states[one], "flags": flags.get(one, [])} for one in self.states]
             digest = self.files.get(node, digest_of(self.text))
-            tasks = [{"name": "merge", "owner": self.owner}]
+            tasks = [{"name": "merge", "owner": self.owner, "pin": self.pin}]
             return {"fleet": "hall", "nodes": nodes, "tasks": tasks, "fleet_file": digest, "schema": "zsched.status/1"}
         if verb == "fleet" and self.changes and self.silent:
             self.silent -= 1
@@ -175,6 +176,18 @@ def test_files_that_the_document_names_are_looked_for_beside_the_fleet_file(
         assert (result.exit_code, "is not on this machine" in result.stderr) == (10, False), result.stderr
     (tmp_path / "etc" / "yard.yaml").unlink()
     assert f"{tmp_path / 'etc' / 'yard.yaml'} is not on this machine" in run("apply", file, "--plan").stderr
+
+
+def test_a_plan_says_whether_the_owner_that_is_no_candidate_any_more_is_left(node: Node, tmp_path: Path) -> None:
+    file = changed(tmp_path, "candidates: {kind: robot}", "candidates: [robot2, edge1]")
+    leaves, stays = "merge leaves robot1: its streams move", "merge stays on robot1, where it is pinned hard"
+    for pin, text in (
+        (None, leaves),
+        ({"node": "robot1", "is_hard": False}, leaves),
+        ({"node": "robot1", "is_hard": True}, stays),
+    ):
+        node.pin = pin
+        assert text in " ".join(run("apply", file, "--plan").stdout.split())
 
 
 def test_a_plan_shows_before_and_after_in_the_files_words_and_changes_nothing(node: Node, tmp_path: Path) -> None:

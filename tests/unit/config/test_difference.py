@@ -116,6 +116,17 @@ def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
     assert told(text, map_merge="edge2") == [(*row, "takes effect at once")]
 
 
+def test_an_owner_to_which_the_task_is_pinned_hard_keeps_it() -> None:
+    """`apply` said that its streams move, and nothing did."""
+    text = with_("candidates: {kind: edge}", "candidates: [edge2]")
+    texts = (TEXT, text)
+    (found,) = difference(fleet_of(TEXT), fleet_of(text), texts, {"map_merge": "edge1"}, bound={"map_merge"})
+    stays = "map_merge stays on edge1, where it is pinned hard, until `zsched unpin map_merge`"
+    assert found.consequence == stays
+    (found,) = difference(fleet_of(TEXT), fleet_of(text), texts, {"map_merge": "edge2"}, bound={"map_merge"})
+    assert found.consequence == "takes effect at once"
+
+
 def test_a_rule_that_comes_goes_or_differs_names_its_streams() -> None:
     line = '      - {from: "{target}/map_merge/{epoch}/tf", to: "{robot}/map_merge/tf", class: latest}\n'
     gone = with_(line, "")
