@@ -315,7 +315,7 @@ def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:
     message = (
         f"the GPU has a {'weight' if is_weighed else 'limit'}, but nothing says how much of it the task uses, and "
     )
-    message += "no driver tells: the GPU counts where the task begins, and the task does not leave its owner for it"
+    message += "no driver tells: the GPU counts in where the task goes, and the task does not leave its owner for it"
     hint = "demand: {gpu: 0.3} (its share of one GPU; `zsched status` shows a machine's use with and without the task)"
     out.warn(section.where(gpu.name), message, hint)
 

@@ -207,8 +207,8 @@ class LinkLimits:
 
     nu_dbm: float = key(
         -80.0,
-        "Least usable signal (Eq. 3): below it the candidate's utility is 0. While a robot reaches the owner, it "
-        "reaches others from 3 dB above it on (`score: service`).",
+        "Least usable signal (Eq. 3): below it the candidate's utility is 0. While the robots reach the owner (by "
+        "`reach`), and for 3 s after that, others count as reached from 3 dB above it on (`score: service`).",
         DBM,
     )
     rho_dbm: float = key(-40.0, "Best achievable signal (Eq. 3); above `nu_dbm`.", DBM)
@@ -243,7 +243,7 @@ class TaskSpec:
     limits: LinkLimits = LinkLimits()
     gauge_limits: Readings = ()
     """Sorted; how far a candidate's gauges may go (`zsched.core.values.gauges`)."""
-    reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate.")
+    reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate, of the robots that answer.")
     memory_floor_ratio: float = key(
         0.05,
         "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
