@@ -1372,16 +1372,38 @@ VOTE_BUGS = (
     _bug(
         "a candidate whose token comes and goes gets the task between two absences",
         "zsched.core.scheduler.unseen",
-        ".union(comes_and_goes)",
-        "",
+        "found |= comes_and_goes",
+        "pass",
         ("tests/unit/core/scheduler/test_unseen.py",),
     ),
     _bug(
-        "candidates whose tokens come and go get nothing though nobody else is seen",
+        "candidates whose tokens come and go get nothing though nobody has the task",
         "zsched.core.scheduler.unseen",
-        "            comes_and_goes = []\n",
-        "            pass\n",
+        "if is_ours or (owner is not None and is_seen.get(owner) and owner not in comes_and_goes):",
+        "if comes_and_goes:",
         ("tests/unit/core/scheduler/test_unseen.py",),
+    ),
+    _bug(
+        "an owner whose token comes and goes is left when it comes back",
+        "zsched.core.scheduler.unseen",
+        " and owner not in comes_and_goes):",
+        "):",
+        ("tests/unit/core/scheduler/test_unseen.py",),
+    ),
+    _bug(
+        "a profile that comes late gives an owner's worker its start-up time again",
+        "zsched.core.scheduler.judge",
+        "self.absences.skip(now)",
+        "self.absences = _of_worker()",
+        ("tests/unit/core/scheduler/test_judge.py",),
+    ),
+    _bug(
+        "an owner that is reached for a moment is not lost for its whole time",
+        "zsched.core.scheduler.judge",
+        "return self.lost.look(not is_reached, now, LOST_S)",
+        "self.lost = Absences() if is_reached else self.lost\n"
+        "        return self.lost.look(not is_reached, now, LOST_S)",
+        ("tests/unit/core/scheduler/test_judge.py",),
     ),
     _bug(
         "what staying has cost is forgotten where the owner is not scored for a moment",

@@ -94,7 +94,7 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
     node.gateway.adopt(fleet)
     node.probation.adopt(fleet)
     node.rested.keep({task.name for task in fleet.tasks}, {one.name for one in fleet.nodes})
-    node.unseen.adopt({task.name for task in fleet.tasks})
+    node.unseen.adopt({task.name for task in fleet.tasks}, {one.name for one in fleet.nodes})
 
 
 def _adopt_choice(node: Stages, fleet: Fleet, anew: AbstractSet[TaskId], todo: ToDo, now: float) -> None:

@@ -18,7 +18,7 @@ from typing import Final
 from zsched.core.absence import Absences
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
 from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
-from zsched.core.scheduler.standing import Standing, joined, pick
+from zsched.core.scheduler.standing import LOST_S, Standing, joined, pick
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
@@ -30,8 +30,14 @@ INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
 _LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, HAS_RESTED)
 """First words of vetoes by which an owner's exclusive worker cannot be at work for long."""
+FORGIVEN_RATIO: Final = 0.1
+"""An owner's worker that is ready makes up so much of the time in which it was not."""
 UNSCORED_S = 2.0
 """An owner that cannot be scored is left after this time: nobody knows the cost of staying there."""
+
+
+def _of_worker(since: float | None = None, total_s: float = 0.0, back_at: float | None = None) -> Absences:
+    return Absences(forgiven_ratio=FORGIVEN_RATIO, since=since, total_s=total_s, back_at=back_at)
 
 
 class Outcome(StrEnum):
@@ -62,10 +68,10 @@ class Judge:
     spec: TaskSpec
     unscored: Absences = dataclasses.field(default_factory=Absences)
     """Of the owner's score, while somebody else could be scored."""
-    absences: Absences = dataclasses.field(default_factory=Absences)
+    absences: Absences = dataclasses.field(default_factory=_of_worker)
     """Of the owner's worker that is ready."""
-    lost_since: float | None = None
-    """Since when the robots do not reach the owner."""
+    lost: Absences = dataclasses.field(default_factory=Absences)
+    """Of the owner from where the robots reach."""
     spent: float = 0.0
     """What staying has cost so far, in utility seconds."""
     spent_at: float | None = None
@@ -89,8 +95,7 @@ class Judge:
         """A vote was lost or the value changed: what staying has cost counts from nothing again."""
         self.unscored, self.spent, self.fit_since = Absences(), 0.0, None
         if is_new_owner:
-            self.lost_since = None
-            self.absences = Absences()
+            self.lost, self.absences = Absences(), _of_worker()
 
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
@@ -99,7 +104,7 @@ class Judge:
         is left once its absences are longer than a start-up (`zsched.core.absence`).
         """
         if profile is None:
-            self.absences = Absences()
+            self.absences.skip(now)
             return 0.0
         load = profile.worker(self.spec.name)
         is_away = load is None or load.state is not WorkerState.READY
@@ -111,12 +116,8 @@ class Judge:
         return self.absences.held_s(self.spec.worker.start_deadline_s)
 
     def lost_for(self, is_reached: bool, now: float) -> float:
-        """For how many seconds the robots have not reached the owner."""
-        if is_reached:
-            self.lost_since = None
-            return 0.0
-        self.lost_since = now if self.lost_since is None else self.lost_since
-        return now - self.lost_since
+        """For how many seconds the robots have not reached the owner, with what former times count."""
+        return self.lost.look(not is_reached, now, LOST_S)
 
     def is_overdue(self, now: float) -> bool:
         """Whether the owner's worker was heard not to be ready for longer than a start may take."""
@@ -133,7 +134,9 @@ class Judge:
             not_ready_since=self.absences.since,
             away_s=self.absences.total_s,
             away_until=self.absences.back_at,
-            lost_since=self.lost_since,
+            lost_since=self.lost.since,
+            lost_s=self.lost.total_s,
+            reached_at=self.lost.back_at,
             spent=self.spent,
             spent_at=self.spent_at,
             seen_first_at=self.seen_first_at,
@@ -145,9 +148,9 @@ class Judge:
 
     def recall(self, memory: JudgeMemory) -> None:
         """Remember that, and nothing else."""
-        self.lost_since = memory.lost_since
+        self.lost = Absences(since=memory.lost_since, total_s=memory.lost_s, back_at=memory.reached_at)
         self.unscored = Absences(since=memory.unscored_since, total_s=memory.unscored_s, back_at=memory.scored_at)
-        self.absences = Absences(since=memory.not_ready_since, total_s=memory.away_s, back_at=memory.away_until)
+        self.absences = _of_worker(memory.not_ready_since, memory.away_s, memory.away_until)
         self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
         self.fit_since = memory.fit_since
         self.learnt = LearntPatience()
@@ -277,8 +280,8 @@ class Judge:
             return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
         if owner not in scored:
             assert self.unscored.since is not None
-            unscored_s = now - self.unscored.since
-            for_long = f"{owner} cannot be scored, for {unscored_s:.1f} of {UNSCORED_S:g} s"
+            held_s, unscored_s = self.unscored.held_s(UNSCORED_S), now - self.unscored.since
+            for_long = f"{owner} cannot be scored, for {unscored_s - held_s:.1f} of {UNSCORED_S - held_s:.3g} s"
             return (Outcome.PROPOSE if unscored_s >= UNSCORED_S else Outcome.WAIT), for_long
         if self.spent < self.patience:
             return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {self.patience:g}"

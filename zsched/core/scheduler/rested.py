@@ -22,6 +22,8 @@ from zsched.core.values.words import HAS_RESTED, RESTS
 
 SURE_S: Final = 3.0
 """An owner's word counts after so long, in all: a lease that electors grant again is told of in less."""
+FORGIVEN_RATIO: Final = 0.1
+"""An owner at work makes up so much of the time in which it has said that it rests: it says so late (`Tenure`)."""
 _NOBODY: Final[Mapping[NodeId, str]] = {}
 
 
@@ -41,7 +43,7 @@ class Rested(Struct):
             if name == task and node != owner.node:  # it is not asked to work
                 others.look(is_away=False, now=now, limit_s=SURE_S)
         if rests and key not in self._absences:
-            self._absences[key] = Absences()
+            self._absences[key] = Absences(forgiven_ratio=FORGIVEN_RATIO)
         for_s = self._absences[key].look(rests, now, SURE_S) if key in self._absences else 0.0
         if for_s >= SURE_S:
             self._doubts.setdefault(key, Doubt(seen_at=now)).see(now)

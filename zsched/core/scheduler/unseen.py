@@ -7,8 +7,8 @@ Control and streams travel on ports of their own. Where a firewall lets the one 
 answers and scores as any other, and no stream reaches its worker. A robot says so when such a worker has been ready and
 unseen for `UNSEEN_S`, while the worker of another candidate is seen: then our own relay's links work, and there is a
 better place. By the task's `reach` such a candidate gets nothing, and an owner is left. One that is unseen again and
-again has that time in all (`zsched.core.absence`), and does not get the task between two absences either, while
-another one is seen that does not come and go.
+again has that time in all (`zsched.core.absence`). Nor does it get the task between two absences, while that has an
+owner which is seen and does not come and go.
 
 Workers that show no token before they own the task say nothing here.
 """
@@ -46,14 +46,24 @@ class Unseen(Struct):
         self._absences.clear()
         self.found.clear()
 
-    def adopt(self, tasks: AbstractSet[TaskId]) -> None:
-        """What was known of other tasks is forgotten."""
+    def adopt(self, tasks: AbstractSet[TaskId], nodes: AbstractSet[NodeId]) -> None:
+        """What was known of other tasks and nodes is forgotten: one of the same name that comes later is another."""
         for task in [task for task in self.found if task not in tasks]:
             del self.found[task]
             self._absences.pop(task, None)
+        for task, known in self._absences.items():
+            self._absences[task] = {name: one for name, one in known.items() if name in nodes}
 
     def look(
-        self, spec: TaskSpec, ready: Iterable[NodeId], tokens: Probation, now: float, period_s: float = 0.0
+        self,
+        spec: TaskSpec,
+        ready: Iterable[NodeId],
+        tokens: Probation,
+        now: float,
+        period_s: float = 0.0,
+        *,
+        owner: NodeId | None = None,
+        is_ours: bool = False,
     ) -> frozenset[NodeId]:
         """The candidates that no stream reaches, as far as it can be told.
 
@@ -63,6 +73,8 @@ class Unseen(Struct):
             tokens: knows which workers our relay sees.
             now: monotonic seconds.
             period_s: the longest time between two looks, while all is well.
+            owner: who has the task.
+            is_ours: that is this node, which needs no token.
         """
         if now - self._looked_at > max(LONGEST_GAP_S, 2.0 * period_s):
             self._absences.clear()
@@ -73,9 +85,9 @@ class Unseen(Struct):
         for name in missed:
             absences.setdefault(name, Absences())
         away_s = {name: one.look(name in missed, now, UNSEEN_S) for name, one in absences.items()}
-        comes_and_goes = [name for name in is_seen if name in absences and absences[name].is_held(now, UNSEEN_S)]
-        if all(name in comes_and_goes for name, seen in is_seen.items() if seen):
-            comes_and_goes = []
-        found = {name for name, for_s in away_s.items() if for_s >= UNSEEN_S}.union(comes_and_goes)
+        comes_and_goes = {name for name in is_seen if name in absences and absences[name].is_held(now, UNSEEN_S)}
+        found = {name for name, for_s in away_s.items() if for_s >= UNSEEN_S}
+        if is_ours or (owner is not None and is_seen.get(owner) and owner not in comes_and_goes):
+            found |= comes_and_goes  # where nobody has it, or not for long, any place is better than none
         self.found[spec.name] = frozenset(found)
         return self.found[spec.name]

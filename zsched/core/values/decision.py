@@ -47,6 +47,8 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
     away_s: float = 0.0
     away_until: float | None = None
     lost_since: float | None = None
+    lost_s: float = 0.0
+    reached_at: float | None = None
     spent: float = 0.0
     spent_at: float | None = None
     seen_first_at: float | None = None

@@ -22,7 +22,7 @@ from zsched.core.scheduler.judge import (
     escape_reason,
 )
 from zsched.core.scheduler.patience import FIRST_PATIENCE, FORGIVEN_IN_S
-from zsched.core.scheduler.standing import Standing, compare
+from zsched.core.scheduler.standing import LOST_S, Standing, compare
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
 from zsched.core.values.profile import Profile, WorkerState
@@ -208,15 +208,33 @@ def test_an_absence_is_held_against_a_worker_for_its_start_up_time_at_most() -> 
 OFTEN = ((WorkerState.STARTING, 18.0), (WorkerState.READY, 5.0)) * 2
 
 
-@pytest.mark.parametrize("is_unheard", [True, False])
-def test_a_new_owner_and_one_that_was_not_heard_begin_with_nothing_held_against_them(is_unheard: bool) -> None:
+def test_a_new_owner_begins_with_nothing_held_against_it() -> None:
     judge = Judge(spec=SPEC)
     away(judge, *OFTEN)
-    if is_unheard:
-        judge.not_ready_for(None, 46.5)
-    else:
-        judge.reset(is_new_owner=True)
+    judge.reset(is_new_owner=True)
     assert judge.not_ready_for(profile(state=WorkerState.STARTING), 47.0) == 0.0
+
+
+def test_an_owner_that_is_not_heard_for_a_moment_has_its_time_neither_longer_nor_shorter() -> None:
+    """A profile that came late each 15 s gave a worker that hung for good its whole start-up time again."""
+    judge, starting = Judge(spec=SPEC), profile(state=WorkerState.STARTING)
+    assert judge.not_ready_for(starting, 0.0) == 0.0
+    assert judge.not_ready_for(starting, 15.0) == 15.0
+    assert judge.not_ready_for(None, 16.0) == 0.0
+    assert judge.not_ready_for(None, 116.0) == 0.0
+    assert judge.not_ready_for(starting, 117.0) == 16.0
+    assert judge.not_ready_for(starting, 117.0 + DEADLINE_S - 16.0 + 0.1) > DEADLINE_S
+
+
+def test_an_owner_that_the_robots_lose_again_and_again_is_lost() -> None:
+    """2.8 s of each 3.6: the 3 s began anew each time."""
+    judge = Judge(spec=SPEC)
+    longest = [max(judge.lost_for(step < 8, 0.1 * step + 3.6 * count) for step in range(36)) for count in range(3)]
+    assert longest[0] < LOST_S
+    assert longest[2] >= LOST_S
+    other = Judge(spec=SPEC)
+    other.recall(judge.memory())
+    assert other.lost_for(False, 11.0) == judge.lost_for(False, 11.0) > LOST_S
 
 
 def test_what_is_held_against_a_worker_is_part_of_the_memory() -> None:
@@ -274,8 +292,9 @@ def test_an_owner_that_can_be_scored_now_and_then_is_left() -> None:
     assert Outcome.PROPOSE in outcomes[40:]
     other = Judge(spec=SPEC)
     other.recall(judge.memory())
-    assert other.unscored == judge.unscored
-    assert other.unscored.total_s > UNSCORED_S
+    known = other.unscored
+    assert (known.since, known.total_s, known.back_at) == (None, judge.unscored.total_s, judge.unscored.back_at)
+    assert known.total_s > UNSCORED_S
 
 
 def test_what_staying_has_cost_is_not_forgotten_where_the_owner_is_not_scored_for_a_moment() -> None:
