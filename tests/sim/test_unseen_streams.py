@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from support.plays import EDGES, TASK, Play
+from zsched.core.values.document import Flag, FlagKind
 from zsched_lab.sim import missed_electors
 from zsched_lab.sim.missed_electors import ROBOTS, moves, working
 from zsched_lab.sim.simulator import Simulator
@@ -52,3 +54,25 @@ def test_one_that_is_there_for_most_of_the_time_is_kept(down_s: float, of_s: flo
     """With a tenth of the time between them forgiven it was left, or left for nothing just when it was back."""
     at_work, moved = played(down_s, of_s, 200.0)
     assert (set(at_work), moved) == ({"edge1"}, 0)
+
+
+def test_a_drained_owner_hands_over_to_one_that_comes_and_goes_where_there_is_no_other() -> None:
+    """A candidate that is held out while the owner may keep the task held up a drain for as long as it flickered."""
+    play = Play()
+    play.adopt()
+    sim, owner = play.sim, play.sim.agreed(TASK)
+    assert owner is not None
+    (other,) = set(EDGES) - {owner}
+    pairs = [pair for robot in ("robot1", "robot2", "robot3") for pair in ((other, robot), (robot, other))]
+    for _ in range(4):
+        sim.data_cuts.update(pairs)
+        sim.run(1.5)
+        for source, target in pairs:
+            sim.work.lose(sim.machines[source], sim.machines[target])
+        sim.run(8.5)
+        sim.data_cuts.clear()
+        sim.run(2.0)
+    assert sim.node("robot1").unseen.found == {TASK: {other}}
+    assert sim.agreed(TASK) == owner
+    play.set_flags(Flag(kind=FlagKind.DRAIN, subject=owner, by="ada@robot1", revision=1))
+    assert sim.run_until(lambda: sim.agreed(TASK) == other, 5.0)

@@ -380,10 +380,11 @@ class Stages:
         unfit = self._with_rested(spec, leaseless, now) if needs_lease else {}
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
-        unseen = self.unseen.look(
-            spec, ready, self.probation, now, self.fleet.timing.decide_s, owner=owner, is_ours=owner == self.me
-        )
         left = frozenset(self.flags.drained)
+        stays = None if owner in left or (told is not None and told.draining) else owner
+        unseen = self.unseen.look(
+            spec, ready, self.probation, now, self.fleet.timing.decide_s, owner=stays, is_ours=stays == self.me
+        )
         if owner is not None and self.rounds.tasks[spec.name].judge.is_overdue(now):
             left |= {owner}
         if not in_grace and not unproven and not unfit and not unseen and not left:

@@ -1391,6 +1391,13 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_unseen.py",),
     ),
     _bug(
+        "a drain waits for a candidate whose token comes and goes",
+        "zsched.core.stages",
+        "stays = None if owner in left or (told is not None and told.draining) else owner",
+        "stays = owner",
+        ("tests/sim/test_unseen_streams.py",),
+    ),
+    _bug(
         "a profile that comes late gives an owner's worker its start-up time again",
         "zsched.core.scheduler.judge",
         "self.absences.skip(now)",
@@ -1415,9 +1422,9 @@ VOTE_BUGS = (
     _bug(
         "each score of an owner gives it its whole time without one again",
         "zsched.core.scheduler.judge",
-        "self.unscored.look(owner not in scored, now, UNSCORED_S)",
-        "self.unscored.look(owner not in scored, now, UNSCORED_S)\n"
-        "        self.unscored = Absences() if owner in scored else self.unscored",
+        "self.unscored.look(not is_scored, now, UNSCORED_S)",
+        "self.unscored.look(not is_scored, now, UNSCORED_S)\n"
+        "        self.unscored = Absences() if is_scored else self.unscored",
         ("tests/unit/core/scheduler/test_judge.py",),
     ),
     _bug(

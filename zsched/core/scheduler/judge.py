@@ -206,7 +206,7 @@ class Judge:
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
         if not is_drain:
-            self._spend(scored, owner, now)
+            self._spend(scored, owner, now, is_scored=owner in standing.aggregates)
         is_kept = allocation.home is not None and not (is_unheard and winner != allocation.home)
         outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, leaving, is_called, now, is_kept)
         cap = None
@@ -231,9 +231,12 @@ class Judge:
         elif self.fit_since is None:
             self.fit_since = now
 
-    def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
-        """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`)."""
-        self.unscored.look(owner not in scored, now, UNSCORED_S)
+    def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float, *, is_scored: bool) -> None:
+        """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`).
+
+        ``is_scored``: the owner is, though it may be left for something else.
+        """
+        self.unscored.look(not is_scored, now, UNSCORED_S)
         if owner is None or owner not in scored:
             self.spent, self.spent_at = 0.0 if owner is None else self.spent, None
             return

@@ -73,7 +73,7 @@ class Unseen(Struct):
             tokens: knows which workers our relay sees.
             now: monotonic seconds.
             period_s: the longest time between two looks, while all is well.
-            owner: who has the task.
+            owner: who has the task, and may keep it.
             is_ours: that is this node, which needs no token.
         """
         if now - self._looked_at > max(LONGEST_GAP_S, 2.0 * period_s):

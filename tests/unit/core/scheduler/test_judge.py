@@ -297,6 +297,14 @@ def test_an_owner_that_can_be_scored_now_and_then_is_left() -> None:
     assert known.total_s > UNSCORED_S
 
 
+def test_the_time_in_which_an_owner_was_to_be_left_for_something_else_is_no_time_without_a_score() -> None:
+    judge = Judge(spec=replace(SPEC, patience=1000.0))
+    for step in range(100):
+        judged(judge, EQUAL, 0.1 * step, escape="edge1 is silent")
+    assert judged(judge, {"edge2": 0.1}, 10.0).outcome is Outcome.WAIT
+    assert judged(judge, {"edge2": 0.1}, 10.0 + UNSCORED_S - 0.1).outcome is Outcome.WAIT
+
+
 def test_what_staying_has_cost_is_not_forgotten_where_the_owner_is_not_scored_for_a_moment() -> None:
     judge, outcomes = Judge(spec=replace(SPEC, patience=0.5)), list[Outcome]()
     for step in range(200):
