@@ -379,10 +379,8 @@ def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest
 
 def test_the_manual_shows_what_the_program_shows() -> None:
     manual = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
-    status = json.loads((RECORDED / "healthy.json").read_text())
-    for stream in status["tasks"][0]["streams"]:
-        stream["hz"] = 50.0
-    at = time.mktime((2026, 3, 4, 14, 3, 26, 0, 0, -1)) + 0.9
+    status = json.loads((RECORDED / "manual.json").read_text())
+    at = time.mktime((2026, 11, 30, 14, 7, 28, 0, 0, -1)) + 0.9
     for render in (render_brief, render_status):
         assert render(status, 100, color=False, at=at) in manual
     for verb in ("up", "init", "status", "weights", "check", "demo", "version"):
