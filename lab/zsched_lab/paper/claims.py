@@ -341,9 +341,8 @@ def declared(
     """(against whom, difference) of a scheme's coverage on the way, of led robots: as declared before their runs.
 
     Against the mean of the fixed schemes and the best of them as known afterwards, or each of them where not all were
-    run, and every other scheme that was run;
-    zsched against ``zsched_slam`` stands with the latter, whose question it is. ``metric``: another figure to compare
-    them by.
+    run, and every other scheme that was run; zsched against ``zsched_slam`` stands with the latter, whose question it
+    is. ``metric``: another figure to compare them by.
     """
     own = led(runs)
     best = best_fixed(own, metric)

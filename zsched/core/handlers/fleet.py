@@ -78,7 +78,7 @@ def follow(node: Stages, fleet: Fleet, todo: ToDo, *, is_agreed: bool = False) -
 
 def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
     """Membership, and what is remembered node by node."""
-    names = frozenset(one.name for one in fleet.nodes)
+    names, tasks = frozenset(one.name for one in fleet.nodes), frozenset(task.name for task in fleet.tasks)
     node.membership.adopt(tuple(one.name for one in fleet.nodes), fleet.timing)
     node.identity.fleet_file, node.identity.beat_s = node.fleet_file, fleet.timing.beat_s
     node.namesakes.adopt(fleet.timing.rest_beat_s)
@@ -93,8 +93,8 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
         del node.problems[source]  # the next beats say it again, where it is still so
     node.gateway.adopt(fleet)
     node.probation.adopt(fleet)
-    node.rested.keep({task.name for task in fleet.tasks}, {one.name for one in fleet.nodes})
-    node.unseen.adopt({task.name for task in fleet.tasks}, {one.name for one in fleet.nodes})
+    node.rested.keep(tasks, names)
+    node.unseen.adopt(tasks, names)
 
 
 def _adopt_choice(node: Stages, fleet: Fleet, anew: AbstractSet[TaskId], todo: ToDo, now: float) -> None:

@@ -37,8 +37,8 @@ class Rested(Struct):
     def hear(self, task: TaskId, owner: Profile, now: float, *, is_explained: bool) -> None:
         """The owner's newest profile; ``is_explained``: beats say why it rests, if it does."""
         load, key = owner.worker(task), (task, owner.node)
-        is_ready = load is not None and load.state is WorkerState.READY and not is_explained
-        rests = is_ready and load is not None and load.reason.startswith(RESTS)
+        word = None if load is None or load.state is not WorkerState.READY or is_explained else load.reason
+        rests = word is not None and word.startswith(RESTS)
         for (name, node), others in self._absences.items():
             if name == task and node != owner.node:  # it is not asked to work
                 others.look(is_away=False, now=now, limit_s=SURE_S)
@@ -47,7 +47,7 @@ class Rested(Struct):
         for_s = self._absences[key].look(rests, now, SURE_S) if key in self._absences else 0.0
         if for_s >= SURE_S:
             self._doubts.setdefault(key, Doubt(seen_at=now)).see(now)
-        elif is_ready and not rests and key in self._doubts:
+        elif word is not None and not rests and key in self._doubts:
             self._doubts[key].keep(now)
 
     def reasons(self, task: TaskId, candidates: Iterable[NodeId], now: float) -> Mapping[NodeId, str]:
