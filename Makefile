@@ -47,11 +47,12 @@ test-all: test  ## All tests
 test-cpu: $(VENV)/.dev  ## Tests that only need a processor: unit, paper, simulator
 	$(BIN)/python -m pytest -q $(ONLY) -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper tests/sim tests/planted
 
-# Real fleets of the system tests keep real time and fill a machine: they have it to themselves.
+# Real fleets of the system tests, and live cells of the bench, keep real time and fill a machine: they have it to
+# themselves.
 test-real: $(VENV)/.dev  ## Tests with real processes (real daemons on localhost, booted machines, bench)
-	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) --durations=10 tests/system
+	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) --durations=10 tests/system tests/bench
 	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 \
-	  tests/booted tests/integration tests/bench tests/parts
+	  tests/booted tests/integration tests/parts
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
 import zenoh
 
 from support.operators import Operator, Stream
@@ -123,6 +124,7 @@ def test_a_task_comes_and_goes_by_the_document_while_a_stream_runs(tmp_path: Pat
         sub.undeclare()
 
 
+@pytest.mark.long
 def test_a_task_becomes_exclusive_by_the_document_and_everybody_s_again_while_a_stream_runs(tmp_path: Path) -> None:
     tree = lossless()
     with streaming(tmp_path, tree) as (bed, _, stream):
@@ -138,6 +140,7 @@ def test_a_task_becomes_exclusive_by_the_document_and_everybody_s_again_while_a_
             bed.wait(partial(has_more, stream, len(stream.back)), 60, "the stream flows on")
 
 
+@pytest.mark.long
 def test_up_with_another_file_founds_nothing_where_a_fleet_is(tmp_path: Path) -> None:
     """A file that was edited by hand is compared and named; by one of another fleet the state counts for nothing."""
     tree = echo_fleet(robots=1, edges=1)

@@ -377,6 +377,7 @@ def _dropped(bus: ControlBus, events: list[ev.Event]) -> set[str]:
     return {f"{event.kind}/{event.reason}" for event in events if isinstance(event, ev.FrameDropped)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("holder", "counted"), [("robot2", "alive/too_many"), ("mallory", "link/stranger")])
 def test_who_shows_thousands_of_tokens_loses_its_link(
     fresh: Yard, holder: str, counted: str, caplog: pytest.LogCaptureFixture
@@ -689,6 +690,7 @@ def _thin(endpoint: str, is_thin: threading.Event) -> Iterator[str]:
         listener.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("who", ["screen", "ana"])
 def test_who_only_looks_and_reads_too_slowly_holds_no_stream_up(fresh: Yard, who: str) -> None:
     """A `reliable` input waits for each receiver; the guest shows that it lives, and takes little."""

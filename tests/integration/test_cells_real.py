@@ -125,6 +125,7 @@ def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(s
     there.bed.send("edge2", signal.SIGCONT)
 
 
+@pytest.mark.long
 def test_a_secured_cell_is_asked_with_a_certificate_of_its_own_authority(tmp_path: Path) -> None:
     tree = {**echo_fleet(robots=1, edges=2), "fleet": B, "security": {"operators": ["ana"]}}
     tree["electorate"] = sorted(tree["nodes"])

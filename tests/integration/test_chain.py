@@ -226,6 +226,7 @@ def test_late_robot_learns_the_allocation_and_its_streams_start(bed: Testbed, pi
     bed.wait(lambda: pinger.has_newer_than(3), 60, "echoes at robot3")
 
 
+@pytest.mark.long
 def test_restart_with_state_keeps_allocation_and_counts_lives(bed: Testbed) -> None:
     """All daemons stop and start again: the learnt owner and epoch are still there, every incarnation is higher."""
     owner = bed.wait_settled()
@@ -298,6 +299,7 @@ def test_remote_status_answers_for_any_node(bed: Testbed) -> None:
     assert "did not answer" in missing["error"]
 
 
+@pytest.mark.long
 def test_without_state_a_robot_votes_but_is_no_elector(tmp_path: Path) -> None:
     """A node without a valid state file works, is no elector, and says so; the other two electors suffice."""
     with Testbed(tmp_path, echo_fleet(edges=1)) as bed:

@@ -228,6 +228,7 @@ def test_up_with_faults_in_the_fleet_file_ends_with_78_and_names_them(tmp_path: 
 # --- more than one node ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_elsewhere", [False, True], ids=["here", "connect"])
 def test_an_order_without_a_quorum_is_told_so_by_the_slowest_timing(tmp_path: Path, *, is_elsewhere: bool) -> None:
     """Its round goes on for 6 s; it is no loop that hangs, and no daemon that is not there."""
@@ -267,6 +268,7 @@ def look_from_a_machine_without_a_daemon(folder: Path, here: Site, there: Site) 
     assert (unknown.returncode, "robot9 did not answer within 3 s" in unknown.stderr) == (3, True)
 
 
+@pytest.mark.long
 def test_a_worker_is_restarted_through_another_node_and_what_it_prints_is_shown(tmp_path: Path) -> None:
     robot, edge = sites(tmp_path, robots=1, edges=1)
     tree = json.loads(robot.file.read_text())
@@ -290,6 +292,7 @@ def test_a_worker_is_restarted_through_another_node_and_what_it_prints_is_shown(
         assert robot.zsched("logs", "echo", robot.node).returncode == 1
 
 
+@pytest.mark.long
 def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path) -> None:
     here, there = sites(tmp_path, robots=1, edges=1)[::-1]
     with contextlib.ExitStack() as stack:
@@ -354,6 +357,7 @@ def test_a_paused_task_is_moved_by_order_and_every_node_says_who_did_it(tmp_path
 # --- why, and what was ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_move_is_explained_remembered_and_judged_again(tmp_path: Path) -> None:
     """The owner is told to stop; its robot says why the task went, also after a restart, and can show it again."""
     edge1, edge2, robot = sorted(sites(tmp_path, robots=1, edges=2), key=lambda site: site.node)

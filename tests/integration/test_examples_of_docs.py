@@ -96,6 +96,7 @@ def test_the_application_with_its_own_streams_is_answered(tmp_path: Path) -> Non
         assert said == [f"robot1/answer {text.upper()}" for text in QUESTIONS]
 
 
+@pytest.mark.long
 def test_a_program_without_the_library_is_told_to_say_ready_matching(tmp_path: Path) -> None:
     program, task = worker_of("docs/guide/worker.md", 1)
     tree = fleet_of(tmp_path, program, task.replace(", ready: matching", ""))
@@ -109,6 +110,7 @@ def test_a_program_without_the_library_is_told_to_say_ready_matching(tmp_path: P
         assert "@zsched/testbed/worker/edge1/shout/" in told[0]
 
 
+@pytest.mark.long
 def test_the_first_fleet_by_its_verbs_answers_its_application(tmp_path: Path) -> None:
     """docs/guide/first-fleet.md, with its task and its application: a secured fleet of two robots and an edge."""
     page, port = "docs/guide/first-fleet.md", block_of_ports(30)

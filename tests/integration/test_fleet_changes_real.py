@@ -113,6 +113,7 @@ class Watch:
         assert [epoch for epoch, _ in self.order] == sorted(epoch for epoch, _ in self.order)
 
 
+@pytest.mark.long
 def test_electors_change_while_an_exclusive_task_works(bed: Testbed) -> None:
     owner = bed.wait_settled()
     watch, operator = Watch(bed), Operator(bed)

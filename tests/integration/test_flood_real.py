@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from support.authorities import secured
 from support.ballots import ballot_of
 from support.beats import beat_of
@@ -23,6 +25,7 @@ COUNT = 10_000
 KEYS = Keyspace("testbed")
 
 
+@pytest.mark.long
 def test_ten_thousand_frames_of_each_kind_change_nothing(tmp_path: Path) -> None:
     tree = secured(echo_fleet(robots=3, edges=1), tmp_path)
     beat = wire.encode(beat_of(IDLE))

@@ -65,6 +65,7 @@ def test_two_machines_are_a_secured_fleet_by_four_commands_and_nobody_restarts_a
     assert [(one["name"], one["state"]) for one in checks] == [("robot1", "valid"), ("robot2", "valid")]
 
 
+@pytest.mark.long
 def test_a_machine_whose_invitation_was_lost_and_that_leaves_later_comes_in_by_the_next_one(hall: Hall) -> None:
     port = block_of_ports(20)
     hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")

@@ -32,6 +32,7 @@ def largest(pid: int) -> int:
     return max((int(size) for one in told if f"pid={pid}," in one for size in SEND_BUFFER.findall(one)), default=0)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("ss") is None, reason="ss (iproute2) tells of another process's sockets")
 @pytest.mark.parametrize("stream_class", StreamClass)
 def test_large_samples_there_and_back_get_large_buffers_on_both_sides(rig: Rig, stream_class: StreamClass) -> None:

@@ -73,6 +73,7 @@ def chain(rig: Rig, stream_class: StreamClass) -> tuple[Task, Task]:
     return first, Task(rig, "second", f"{ROBOT}/between", f"{ROBOT}/out", stream_class)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
 def test_a_chain_of_tasks_through_one_relay_survives_the_moves_of_either(rig: Rig, stream_class: StreamClass) -> None:
     first, second = tasks = chain(rig, stream_class)

@@ -30,6 +30,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         yield made
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("on_crash", [OnCrash.REPLAY, OnCrash.REPORT])
 @pytest.mark.parametrize("is_first", [False, True])
 def test_no_answer_is_missing_of_what_a_dead_owner_had_acknowledged(

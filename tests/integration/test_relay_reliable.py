@@ -214,6 +214,7 @@ def test_a_stalled_workers_full_queue_delays_no_other_stream(rig: Rig) -> None:
         within(beside.longest_gap(), 0.9, "without a sample")
 
 
+@pytest.mark.long
 def test_a_slow_workers_full_queue_slows_its_own_application_and_no_other(rig: Rig) -> None:
     """Back-pressure is the link's: what else this application sends waits, too, and comes; another one's flows."""
     rig.start_worker("edge1", "--delay-ms", "1")

@@ -241,6 +241,7 @@ def test_a_relay_that_is_killed_is_restarted_with_the_newest_plan(rig: Rig) -> N
     until(lambda: app.put() or len(app.back) > before, "the stream flows again")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stream_class", [StreamClass.RELIABLE, StreamClass.LATEST])
 @pytest.mark.parametrize("times", [1, 2])
 def test_an_owner_that_heard_a_relay_that_was_killed_drains_all_the_same(

@@ -101,6 +101,7 @@ def flags_at(bed: Testbed, node: str) -> dict[tuple[str, str], str]:
     return {(one["name"], flag["kind"]): flag["by"] for one in nodes for flag in one.get("flags", ())}
 
 
+@pytest.mark.long
 def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

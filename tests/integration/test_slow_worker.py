@@ -18,6 +18,7 @@ SENT = 200
 PERIOD_S = 0.005
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("keep_last", ["", "1"], ids=["default", "keep_last=1"])
 def test_what_a_slow_worker_skips_of_a_reliable_input_is_counted_lost(tmp_path: Path, keep_last: str) -> None:
     tree = echo_fleet(robots=1, edges=1, timing="wired", worker=("python", str(WORKER)), stream_class="reliable")

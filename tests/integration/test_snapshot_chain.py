@@ -81,10 +81,15 @@ def counting(
     ("link", "save_s", "stops", "has_certificates"),
     [
         ("peer", 0.0, False, False),
-        ("client", 0.0, False, False),
-        ("peer", 1.0, True, False),
-        ("peer", 0.0, False, True),
-        ("client", 0.0, False, True),
+        *(
+            pytest.param(*other, marks=pytest.mark.long)
+            for other in (
+                ("client", 0.0, False, False),
+                ("peer", 1.0, True, False),
+                ("peer", 0.0, False, True),
+                ("client", 0.0, False, True),
+            )
+        ),
     ],
 )
 def test_the_state_moves_with_the_task(

@@ -97,6 +97,7 @@ def test_every_socket_of_every_process_speaks_tls(bed: Testbed) -> None:
         assert not [one for one in bed.status(node)["problems"] if one.startswith("tls")]
 
 
+@pytest.mark.long
 def test_init_asks_the_fleet_over_tls(bed: Testbed) -> None:
     """A blank state for a name that has voted is refused, as it is without certificates."""
     bed.wait(lambda: "robot2" in bed.status("robot1")["quorum"]["voted"], 60, "robot1 to remember robot2's vote")

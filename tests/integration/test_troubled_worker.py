@@ -86,6 +86,7 @@ def test_a_callback_that_raises_is_in_every_node_s_status(bed: Testbed) -> None:
     kept.undeclare()
 
 
+@pytest.mark.long
 def test_a_failed_worker_is_told_everywhere_and_comes_back_when_it_is_tried_again(bed: Testbed) -> None:
     broken = bed.folder / "broken-edge1"
     broken.touch()

@@ -14,6 +14,7 @@ def test_nothing_is_chosen_twice_forgotten_or_stuck(block: int) -> None:
     assert [played.violation for seed in range(40 * block, 40 * block + 40) if (played := play(seed)).violation] == []
 
 
+@pytest.mark.long
 def test_the_runs_have_every_kind_of_change_and_fault() -> None:
     counts = sum((play(seed).counts for seed in range(1, 200)), start=play(0).counts)
     kinds = {"AddElector", "RemoveElector", "SetDocument", "SetLease", "Settle", "MoveOwner"}
@@ -30,6 +31,7 @@ def test_same_seed_same_play() -> None:
     assert pool(7) == pool(7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("owner", "name", "instead"),
     [

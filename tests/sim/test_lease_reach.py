@@ -139,6 +139,7 @@ def test_so_is_one_that_rests_again_and_again_and_never_for_long(down_s: float, 
     assert set(at_work[round(within_s / 0.1) :]) == {"edge2"}
 
 
+@pytest.mark.long
 def test_where_every_candidate_rests_the_task_is_tried_elsewhere_ever_more_seldom() -> None:
     sim = unseen_by_robots("edge1", "edge2")
     before = moves(sim)
@@ -148,6 +149,7 @@ def test_where_every_candidate_rests_the_task_is_tried_elsewhere_ever_more_seldo
     assert sim.run_until(lambda: working(sim) != "", 5.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("is_busy", "down_s", "most_moves"), [(False, 5.0, 1), (True, 1.6, 12), (True, 5.0, 20)])
 def test_a_link_that_is_down_now_and_then_costs_the_task_little(is_busy: bool, down_s: float, most_moves: int) -> None:
     """Without a word about electors it stood still for a quarter of the time where the link is down that long."""

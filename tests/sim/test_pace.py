@@ -18,6 +18,7 @@ LEAST_SLOW = 0.05
 """At least this share of the beats is followed by a slow one."""
 
 
+@pytest.mark.long
 def test_fleets_that_slow_down_between_faults_keep_every_promise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pace, "FULL_S", 0.3)
     counted, next_at = Counter[bool](), pace.Pace.next_at

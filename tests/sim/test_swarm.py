@@ -64,6 +64,7 @@ def test_plans_have_every_fault_every_size_and_every_kind_of_task() -> None:
     assert any(not one.faults for one in plans), "and some in which nothing goes wrong"
 
 
+@pytest.mark.long
 def test_many_tasks_with_slow_workers_all_leave_a_busy_owner_in_the_end() -> None:
     """Found by the simulator: each vote asked an owner to leave, and the next on that task came when it had stayed."""
     one = plan(598)
@@ -105,6 +106,7 @@ def test_a_daemon_that_leaves_its_name_does_so_behind_all_else() -> None:
     assert play(plan(9040656)).violation == ""
 
 
+@pytest.mark.long
 def test_every_fault_that_is_planned_is_carried_out() -> None:
     done: set[str] = set()
     planned: set[str] = set()

@@ -49,6 +49,7 @@ def test_the_owner_is_left_and_does_not_get_the_task_back(down_s: float, of_s: f
     assert set(at_work[round(within_s / 0.1) :]) == {"edge2"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("down_s", "of_s"), [(6.0, 30.0), (11.0, 100.0)])
 def test_one_that_is_there_for_most_of_the_time_is_kept(down_s: float, of_s: float) -> None:
     """With a tenth of the time between them forgiven it was left, or left for nothing just when it was back."""

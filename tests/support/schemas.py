@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import jsonschema
-
 from zsched.commands.common import SCHEMAS
 
 
@@ -24,6 +22,8 @@ def closed(schema: Any) -> Any:
 
 def faults(body: Any) -> list[str]:
     """What is wrong with an output by the file of the schema that it names."""
+    import jsonschema  # it reads grammars for seconds, in each process that imports it
+
     name, _, major = body["schema"].partition("/")
     schema = json.loads((SCHEMAS / f"{name}.{major}.json").read_text())
     validator = jsonschema.Draft202012Validator(closed(schema))

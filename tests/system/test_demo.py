@@ -131,11 +131,16 @@ MOMENTS = {
 @pytest.mark.parametrize(
     ("number", "moment"),
     [
-        (signal.SIGINT, "starting"),
-        (signal.SIGINT, "coming up"),
-        (signal.SIGINT, "loaded"),
-        (signal.SIGKILL, "starting"),
-        (signal.SIGKILL, "driving"),
+        *(
+            pytest.param(*other, marks=pytest.mark.long)
+            for other in (
+                (signal.SIGINT, "starting"),
+                (signal.SIGINT, "coming up"),
+                (signal.SIGINT, "loaded"),
+                (signal.SIGKILL, "starting"),
+                (signal.SIGKILL, "driving"),
+            )
+        ),
         (signal.SIGKILL, "loaded"),
     ],
 )

@@ -11,8 +11,9 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Final
 
@@ -83,12 +84,17 @@ OUTSIDE: Final[dict[str, str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Module:
     """One source file: its name below ``zsched.`` and what it imports."""
 
     name: str
-    tree: ast.Module
+    read: Callable[[], str]
+
+    @cached_property
+    def tree(self) -> ast.Module:
+        """Parsed when it is asked for: each process that runs any test imports this file."""
+        return ast.parse(self.read())
 
     @property
     def place(self) -> tuple[int, str]:
@@ -117,7 +123,7 @@ def read_modules() -> dict[str, Module]:
         for path in sorted(package.rglob("*.py")):
             parts = (*above, *path.relative_to(package).with_suffix("").parts)
             name = ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
-            modules[name] = Module(name=name, tree=ast.parse(path.read_text(encoding="utf-8")))
+            modules[name] = Module(name=name, read=partial(path.read_text, encoding="utf-8"))
     return modules
 
 
@@ -160,10 +166,10 @@ def test_planted_import_of_a_higher_floor_is_found() -> None:
         ("tasks.other", "from zsched.tasks.map_merge import grid"),
         ("adapters.host.systemd", "from zsched import daemon"),
     ):
-        assert faults_of_floor(Module(name=name, tree=ast.parse(line))), (name, line)
+        assert faults_of_floor(Module(name=name, read=partial(str, line))), (name, line)
 
 
-def find_circle(graph: dict[str, set[str]]) -> list[str]:
+def find_circle(imports: dict[str, set[str]]) -> list[str]:
     """Some circle of imports, empty when there is none."""
     done: set[str] = set()
 
@@ -172,32 +178,34 @@ def find_circle(graph: dict[str, set[str]]) -> list[str]:
             return [*path[path.index(name) :], name]
         if name in done:
             return []
-        for target in sorted(graph[name]):
+        for target in sorted(imports[name]):
             circle = visit(target, [*path, name])
             if circle:
                 return circle
         done.add(name)
         return []
 
-    return next((circle for name in sorted(graph) if (circle := visit(name, []))), [])
+    return next((circle for name in sorted(imports) if (circle := visit(name, []))), [])
 
 
-GRAPH: Final = {name: targets(module) for name, module in MODULES.items()}
+@cache
+def graph() -> dict[str, set[str]]:
+    return {name: targets(module) for name, module in MODULES.items()}
 
 
 def test_there_are_no_circles() -> None:
-    assert find_circle(GRAPH) == []
+    assert find_circle(graph()) == []
 
 
 def test_planted_circle_is_found() -> None:
     assert find_circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
 
 
-FOLDERS: Final = ("", *sorted({name[: match.start()] for name in GRAPH for match in re.finditer(r"\.", name)}))
+FOLDERS: Final = ("", *sorted({name[: match.start()] for name in MODULES for match in re.finditer(r"\.", name)}))
 """Every folder with code, by its dotted name; ``""`` is ``zsched/`` itself."""
 
 
-def rooms_in(folder: str, graph: dict[str, set[str]]) -> dict[str, set[str]]:
+def rooms_in(folder: str, modules: dict[str, set[str]]) -> dict[str, set[str]]:
     """{room: rooms that it imports} of one folder: its folders and its modules.
 
     No circle of modules is needed for a circle of rooms: two modules of one folder are enough.
@@ -207,16 +215,16 @@ def rooms_in(folder: str, graph: dict[str, set[str]]) -> dict[str, set[str]]:
     def inside(names: Iterable[str]) -> set[str]:
         return {name.removeprefix(prefix).partition(".")[0] for name in names if name.startswith(prefix)}
 
-    rooms: dict[str, set[str]] = {room: set() for room in inside(graph)}
-    for name, found in graph.items():
+    rooms: dict[str, set[str]] = {room: set() for room in inside(modules)}
+    for name, found in modules.items():
         for room in inside([name]):
-            rooms[room] |= inside(found & set(graph)) - {room}
+            rooms[room] |= inside(found & set(modules)) - {room}
     return rooms
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_there_are_no_circles_of_rooms(folder: str) -> None:
-    assert find_circle(rooms_in(folder, GRAPH)) == []
+    assert find_circle(rooms_in(folder, graph())) == []
 
 
 @pytest.mark.parametrize(
@@ -230,8 +238,8 @@ def test_there_are_no_circles_of_rooms(folder: str) -> None:
 )
 def test_planted_circle_of_rooms_is_found(importer: str, imported: str) -> None:
     """Each of these imports makes a circle of folders; the first one had none of modules."""
-    graph = {**GRAPH, importer: GRAPH[importer] | {imported}}
-    assert any(find_circle(rooms_in(folder, graph)) for folder in FOLDERS)
+    planted = {**graph(), importer: graph()[importer] | {imported}}
+    assert any(find_circle(rooms_in(folder, planted)) for folder in FOLDERS)
 
 
 STAGES: Final = ("profile", "gateway", "scheduler", "vote", "executor", "route")
@@ -251,9 +259,9 @@ def later_stages(name: str, found: set[str]) -> list[str]:
     return sorted(one for one in found if -1 < own < place(one) and (name, one) not in LENT)
 
 
-@pytest.mark.parametrize("name", sorted(name for name in GRAPH if name.startswith("core.")))
+@pytest.mark.parametrize("name", sorted(name for name in MODULES if name.startswith("core.")))
 def test_no_stage_imports_a_later_one(name: str) -> None:
-    assert later_stages(name, GRAPH[name]) == []
+    assert later_stages(name, graph()[name]) == []
 
 
 def test_planted_import_of_a_later_stage_is_found() -> None:
@@ -263,7 +271,7 @@ def test_planted_import_of_a_later_stage_is_found() -> None:
 
 
 def test_what_a_stage_takes_of_a_later_one_is_still_taken() -> None:
-    assert [pair for pair in LENT if pair[1] not in GRAPH[pair[0]]] == []
+    assert [pair for pair in LENT if pair[1] not in graph()[pair[0]]] == []
 
 
 CORE: Final = sorted(name for name in MODULES if name.partition(".")[0] == "core")
@@ -310,7 +318,7 @@ def test_core_is_pure(name: str) -> None:
     ],
 )
 def test_planted_impurity_is_found(line: str) -> None:
-    assert faults_of_purity(Module(name="core.model", tree=ast.parse(line)))
+    assert faults_of_purity(Module(name="core.model", read=partial(str, line)))
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))

@@ -102,6 +102,7 @@ def test_what_a_relay_has_seen_that_ended_says_nothing_of_the_next_process(house
     until(lambda: house.states("node")[-1] is WorkerState.READY, "the next relay sees it")
 
 
+@pytest.mark.long
 def test_no_worker_is_ended_while_no_relay_could_see_it(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its token went, as its link broke; then the relay was away for longer than a worker may take to start."""
     monkeypatch.setattr(crew_module, "MISSED_S", 2.0)

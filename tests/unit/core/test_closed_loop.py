@@ -609,6 +609,7 @@ ONE_THREAD = tuple(
 WITH_NETWORK = Weights(cpu=0.6, memory=0.0, network=0.4)
 
 
+@pytest.mark.long
 @settings(derandomize=True, database=None, deadline=None, max_examples=12)
 @example(machines=SHORT_OF_MEMORY, weights=BOTH, job_s=None, deadline_ms=None)
 @example(machines=FAR_AWAY, weights=WITH_NETWORK, job_s=None, deadline_ms=None)

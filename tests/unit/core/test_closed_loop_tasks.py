@@ -286,6 +286,7 @@ TAKES_THE_REST = (
 """The second one lacks nothing, and leaves somebody else's thread a little too little."""
 
 
+@pytest.mark.long
 @settings(derandomize=True, database=None, deadline=None, max_examples=12)
 @example(fleet=WAITING_FOR_IT, weights=BOTH)
 @example(fleet=TAKES_THE_REST, weights=BOTH)

@@ -184,6 +184,7 @@ def fleet(tasks: int, length: int) -> Fleet:
     return fleet_of(*(task_of(one, ROBOTS, worker=worker, exclusive=True) for one in named), of=ROBOTS)
 
 
+@pytest.mark.long
 def test_electors_of_more_exclusive_tasks_than_a_beat_has_room_for_stay_alive_and_all_tasks_work() -> None:
     big = fleet(60, 63)
     assert most_bytes(big) > MAX_BEAT_BYTES, "check refuses it; here it runs all the same"

@@ -17,6 +17,7 @@ def test_a_hall_is_fixed_by_its_seed_and_its_machines_drive_apart() -> None:
     assert one[0].rssi_dbm.size == pytest.approx(halls.DRIVE_S / 0.2)
 
 
+@pytest.mark.long
 def test_patience_trades_signal_for_calm() -> None:
     found = {row.rule: row for row in halls.rows(range(3), are_robots=True)}
     least, most = found["patience 0.2"], found["patience 0.6"]

@@ -87,7 +87,7 @@ def _at(table: Array, step: int, column: int) -> float:
     ("seed", "scatter", "tuning", "patience", "learns"),
     [
         (1, 0.0, SLOW, PAPER_PATIENCE, False),
-        (2, 0.03, PATIENT, PAPER_PATIENCE, False),
+        pytest.param(2, 0.03, PATIENT, PAPER_PATIENCE, False, marks=pytest.mark.long),
         (2, 0.03, PATIENT, FIRST_PATIENCE, True),
     ],
 )
