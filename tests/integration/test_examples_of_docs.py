@@ -68,7 +68,11 @@ def run_text(text: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("name", "number", "is_loud"),
-    [("docs/guide/worker.md", 0, True), ("docs/guide/worker.md", 1, True), ("README.md", 0, False)],
+    [
+        ("docs/guide/worker.md", 0, True),
+        pytest.param("docs/guide/worker.md", 1, True, marks=pytest.mark.long),
+        ("README.md", 0, False),
+    ],
 )
 def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
     tmp_path: Path, name: str, number: int, is_loud: bool
@@ -84,6 +88,7 @@ def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
         assert len(said) >= len(QUESTIONS) - 2
 
 
+@pytest.mark.long
 def test_the_application_with_its_own_streams_is_answered(tmp_path: Path) -> None:
     tree = fleet_of(tmp_path, *worker_of("docs/guide/worker.md", 0))
     tree["nodes"]["robot1"]["listen"]["streams"] = free_endpoint()

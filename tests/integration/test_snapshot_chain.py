@@ -133,6 +133,7 @@ def test_the_state_follows_a_task_that_moves_twice_at_once(tmp_path: Path, edges
         assert f"restored epoch=3 from={second}" in bed.log(third)
 
 
+@pytest.mark.long
 def test_an_owner_s_worker_that_is_started_again_is_not_given_the_state_of_before_the_move(tmp_path: Path) -> None:
     """It is older than what was done since; without one the worker knows that it has to begin anew."""
     with counting(tmp_path, "0", str(TIMEOUT_S)) as (bed, first, totals, publisher):

@@ -65,6 +65,7 @@ def first_words() -> bytes:
     return said
 
 
+@pytest.mark.long
 @pytest.mark.root
 @pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))
 @pytest.mark.timeout(90)
