@@ -117,7 +117,7 @@ def _of_tasks(tasks: list[Json]) -> Iterator[Family]:
     ages = [({"task": task["name"]}, task["since_s"]) for task in tasks if task["since_s"] is not None]
     yield "zsched_task_owner_known_seconds", "gauge", "Since this node learnt of the owner.", ages
     alone = [({"task": t["name"]}, any(text.startswith(NO_SPARE) for text in t["problems"])) for t in tasks]
-    yield "zsched_task_without_spare", "gauge", "No worker of another living candidate could take it over.", alone
+    yield "zsched_task_without_spare", "gauge", "No other living candidate could take it over.", alone
     joint = [
         (t["name"], name, value) for t in tasks if t["decision"] for name, value in t["decision"]["aggregates"].items()
     ]

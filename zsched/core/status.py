@@ -11,9 +11,10 @@ from collections.abc import Iterable, Iterator
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rollouts import waiting
 from zsched.core.route.rates import STALE_S
-from zsched.core.scheduler.eligibility import may_get
+from zsched.core.scheduler.eligibility import is_of_machine, may_get
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
+from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import joined
 from zsched.core.stages import Stages, Unready
 from zsched.core.values.deadline import tells_jobs
@@ -68,6 +69,8 @@ HUNG_TIMES = 16.0
 `zsched.core.profile.jobs.UNENDED_S` does not..."""
 HUNG_FIRST_S = 30.0
 """...and, of a worker that has ended none of late, one that takes so long: a first job may load a model."""
+LATE_RATIO = 0.5
+"""A deadline that so many of a task's jobs miss is a problem, wherever the task is."""
 UNREADY_SHOWN_S = 2.0
 """A slot that no worker takes for longer is a problem: a handover takes less."""
 
@@ -488,6 +491,12 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
             yield f"the worker on {name} {told_of_worker(load.state, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {name}{why}"
+        late_ratio = None if load.jobs is None else load.jobs.late_ratio
+        if load.state is WorkerState.READY and name == owner and late_ratio is not None and late_ratio >= LATE_RATIO:
+            yield (
+                f"the worker on {name} ends {late_ratio * 100:.0f} % of its jobs later than the deadline; "
+                f"`zsched explain {task.name}` tells what each machine is worth"
+            )
         if load.state is WorkerState.READY and name == owner and load.unended_s is not None and _hangs(load):
             more = f", and {load.jobs.backlog} wait" if load.jobs is not None and load.jobs.backlog else ""
             anew = f"see `zsched logs {task.name}`, `zsched restart {task.name}` starts it anew"
@@ -495,8 +504,10 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
                 f"the worker on {name} has had work for {load.unended_s:.0f} s and finished no job{more}: it "
                 f"may hang in a callback; {anew if task.worker.command else 'start it again there'}"
             )
-    if owner is not None and owner == server and is_server_ready and node.membership.state(owner) is PeerState.ALIVE:
-        yield from _no_spare(node, task, owner, now)
+    state = PeerState.UNKNOWN if owner is None else node.membership.state(owner)
+    is_served = owner == server and is_server_ready and state is PeerState.ALIVE
+    if owner is not None and (is_served or state in (PeerState.SUSPECT, PeerState.GONE)):
+        yield from _no_spare(node, task, value, owner, now)
     for name in sorted(node.unseen.found.get(task.name, ())):
         if name != owner:  # of the owner the wait is told, below
             is_seen = node.probation.sees(name, task.name)
@@ -540,16 +551,26 @@ def _may_follow(node: Stages, task: TaskSpec, profile: Profile, server: NodeId |
     return name != server and name in task.candidates and name not in node.flags.closed and not profile.draining
 
 
-def _no_spare(node: Stages, task: TaskSpec, owner: NodeId, now: float) -> Iterator[str]:
-    """That no worker could take a task over now; nodes that are away, or closed by an operator, are no trouble."""
+def _no_spare(node: Stages, task: TaskSpec, value: Allocation, owner: NodeId, now: float) -> Iterator[str]:
+    """That nobody could take a task over now; nodes that are away, or closed by an operator, are no trouble.
+
+    What machines lack is told as it would be if the owner were gone: then the file's figure counts, and no margin.
+    """
     is_missed, untold = False, list[str]()
+    states = {**node.membership.states(), owner: PeerState.GONE}
+    refused = dict(score(task.under(value.tuning), value, node.me, node.gateway, states, now).refused)
     for profile in _heard(node, now):
         if not _may_follow(node, task, profile, owner):
             continue
         load = profile.worker(task.name)
         is_told = load is not None and (load.state is WorkerState.FAILED or _is_in_the_way(task, load))
+        lack = refused.get(profile.node, "")
         if not is_told and may_get(task, None if load is None else load.state):
-            return
+            if not is_of_machine(lack):
+                return
+            untold.append(f"{profile.node} {lack}" if lack.startswith("needs") else f"on {profile.node} {lack}")
+            is_missed = True
+            continue
         is_missed = True
         if load is None:
             untold.append(f"{profile.node} runs no worker for it")

@@ -26,7 +26,16 @@ from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag, FlagKind
-from zsched.core.values.fleet import Fleet, OnIsolation, Security, Standby, WorkerSpec, electorate_hash, lease_terms
+from zsched.core.values.fleet import (
+    Demand,
+    Fleet,
+    OnIsolation,
+    Security,
+    Standby,
+    WorkerSpec,
+    electorate_hash,
+    lease_terms,
+)
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import PeerState, ScoreForm
 from zsched.core.values.plan import ReadyWhen, StreamCount
@@ -684,6 +693,55 @@ def test_a_task_that_no_other_candidate_could_take_now_says_why() -> None:
     assert problems_of(node) == (failed, "no other candidate can take it: edge2 runs no worker for it")
     told_by(node, "edge1", 2, WorkerState.STARTING)
     assert problems_of(node) == ("the worker on edge1 is starting", failed), "it is not served: that is said first"
+
+
+def holding(node: Node, name: str, at: float, *, used_mb: float, own_mb: float = 0.0, battery: float = 1.0) -> None:
+    """A node of 4000 MiB whose worker is ready."""
+    worker = load_of(memory_mb=own_mb, cpu_cores=0.1)
+    profile = profile_of(
+        name,
+        incarnation=3,
+        sequence=round(at),
+        memory_used_mb=used_mb,
+        workers=(worker,),
+        gauges=(("battery", battery),),
+    )
+    node.handle(ev.ProfileReceived(profile=profile), at)
+
+
+def lacking(now: float = 100.0, **machines: dict[str, float]) -> tuple[str, ...]:
+    """Problems of a task that needs 500 MiB and a battery above 20 %, and that edge1 serves or has served."""
+    task = task_of(candidates=EDGES, demand=Demand(memory_mb=500.0), gauge_limits=(("battery", 0.2),))
+    node = make(alive=(*ROBOTS, *EDGES), fleet=fleet_of(task, of=sorted((*ROBOTS, *EDGES)), electors=ROBOTS))
+    learn(node, 1, "edge1")
+    holding(node, "edge1", 100.0, used_mb=3500.0, own_mb=2500.0)
+    for at in (100.0 + s for s in range(round(now) - 99)):
+        for name in ("edge2", "robot2", "robot3"):
+            node.handle(ev.BeatReceived(beat=beat_of(name, round(at), incarnation=3)), at)
+        for name, figures in machines.items():
+            holding(node, name, at, **figures)
+        node.handle(ev.DeadlineReached(), at)
+    return tuple(one for one in build_snapshot(node, now).tasks[0].problems if "no other candidate" in one)
+
+
+def test_a_task_that_no_other_machine_has_room_for_says_what_it_lacks() -> None:
+    assert lacking(edge2={"used_mb": 3400.0}) == (), "what the worker has come to use counts only while it has an owner"
+    needs = "no other candidate can take it: edge2 needs 500 MiB, has 400 free"
+    assert lacking(edge2={"used_mb": 3600.0}) == (needs,)
+    assert lacking(103.0, edge2={"used_mb": 3600.0}) == (needs,), "its owner is silent: then it says why nobody has it"
+    low = "no other candidate can take it: on edge2 battery is at 18 %, limit 20 %"
+    assert lacking(edge2={"used_mb": 500.0, "battery": 0.18}) == (low,)
+    assert lacking(edge2={"used_mb": 500.0, "battery": 0.21}) == (), "the margin is for whoever could stay"
+
+
+def test_a_task_that_misses_its_deadline_most_of_the_time_is_a_problem() -> None:
+    for late_ratio, count in ((None, 0), (0.49, 0), (0.5, 1)):
+        node = served()
+        told_by(node, "edge2", 1, WorkerState.READY, jobs=Jobs(time_s=0.3, cpu_s=0.1, late_ratio=1.0))
+        told_by(node, "edge1", 2, WorkerState.READY, jobs=Jobs(time_s=0.3, cpu_s=0.1, late_ratio=late_ratio))
+        assert len(problems_of(node)) == count
+    said = "the worker on edge1 ends 50 % of its jobs later than the deadline; `zsched explain merge` tells what each "
+    assert problems_of(node) == (f"{said}machine is worth",)
 
 
 def test_a_standby_that_a_move_starts_is_ready_enough() -> None:

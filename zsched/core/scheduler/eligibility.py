@@ -108,6 +108,15 @@ def is_for_comers(reason: str) -> bool:
     return reason.startswith(_NEEDS) or _BACK in reason
 
 
+def is_of_machine(reason: str) -> bool:
+    """Whether a refusal says what the machine lacks: memory, or a gauge within its limit.
+
+    >>> [is_of_machine(why) for why in ("battery is at 18 %, limit 20 %", "no fresh profile")]
+    [True, False]
+    """
+    return reason.startswith((_NEEDS, *(f"{name} " for name in BY_NAME)))
+
+
 def _beyond_limits(
     spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool, is_kept: bool
 ) -> str:

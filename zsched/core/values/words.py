@@ -45,7 +45,7 @@ HAS_RESTED = "it rested there for want of a lease"
 RESTS = "it rests, for it has no lease"
 """First words of what an exclusive task's owner says of its worker, which is ready."""
 NO_SPARE = "no other candidate can take it"
-"""First words of the problem that a task is served, and no worker of another living candidate could take it over."""
+"""First words of the problem that no other living candidate could take a task over."""
 COUNTED_ANEW = "since the relay's start or the stream's last change"
 """A stream keeps its count over both, so a message in it may have come before."""
 _READY = "ready"
@@ -82,7 +82,7 @@ def told_of_hand(task: str, cell: str, fleet: str) -> str:
 def check_range(field: str, value: float | None, low: float, high: float) -> None:
     """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
     if value is not None and not low <= value <= high:
-        raise ValueError(f"{field}: {value!r} is not in [{low:g}, {high:g}]")
+        raise ValueError(f"{field}: {value!r} is not in [{low:.10g}, {high:.10g}]")
 
 
 def missed(drops: Iterable[tuple[str, int]], lost: int, at_most_lost: int) -> int:
