@@ -160,7 +160,13 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Json]:
     if entry is None:
         is_edge = answer["explanation"]["kind"] == "edge"
         edge = f"; {node} is an edge and decides nothing: ask on a robot" if is_edge else ""
-        when = f"before epoch {point.epoch}" if point.epoch is not None else f"until {point.word}"
+        when = (
+            f"before epoch {point.epoch}"
+            if point.epoch is not None
+            else f"of {point.word} ago or before"
+            if point.age_s is not None
+            else f"until {point.word}"
+        )
         raise CliError(EXIT_FAILED, f"the log of {node} has no judgement of {task} {when}{edge}")
     written: Json = entry["decision"]
     told = _sums(written)

@@ -58,6 +58,9 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
         check_name(status, "task", name, list(known))
     if order.node is not None:
         check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
+    if order.node is not None and len(chosen) == 1 and order.node not in known[chosen[0]]["candidates"]:
+        able = ", ".join(known[chosen[0]]["candidates"])
+        raise CliError(EXIT_FAILED, f"{chosen[0]}: invalid: {order.node!r} is no candidate; there are {able}")
     if not chosen:
         return _list_holds(view, order.hold, list(known.values()))
     if view.revision is not None and len(chosen) > 1:

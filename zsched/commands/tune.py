@@ -106,8 +106,8 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     if name is None or not pairs:
         return _list_tunings(view, [known[name]] if name is not None else list(known.values()))
     task = known[name]
-    after = tuned(task["tuning"], _file_tuning(task), pairs)
-    tuning = _checked(after, _file_tuning(task))
+    after = tuned(task["tuning"], file_tuning(task), pairs)
+    tuning = _checked(after, file_tuning(task))
     flat_before, flat_after = _flat(task["tuning"]), _flat(after)
     rows = [
         (name, key, _figure(key, flat_before.get(key, 0.0)), _figure(key, flat_after.get(key, 0.0)))
@@ -116,7 +116,7 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     ]
     if flat_after["deadline_ms"] not in (None, flat_before["deadline_ms"]) and task.get("tells_no_jobs"):
         warn(f"{name}: {TELLS_NOTHING}")
-    told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(_file_tuning(task))}
+    told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(file_tuning(task))}
     planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
     code = begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
     if code is not None:
@@ -154,7 +154,7 @@ def _checked(after: Json, file: Json) -> Json:
     nu, rho = tuning.nu_dbm, tuning.rho_dbm
     if nu is not None and rho is not None and nu >= rho:
         raise CliError(EXIT_USAGE, f"nu_dbm ({nu:g}) must be below rho_dbm ({rho:g}); nothing was changed")
-    check_deadline(after)
+    check_deadline(after, file)
     by_file = {**file, "patience": _file_patience(after, file)}
     kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == by_file.get(key)}
     body: Json = as_plain(replace(tuning, **kept))
@@ -164,11 +164,16 @@ def _checked(after: Json, file: Json) -> Json:
 _INSTEAD: Final = {DeadlineFault.PAPER: "score=service", DeadlineFault.NO_CPU: "a weight for cpu"}
 
 
-def check_deadline(tuning: Json) -> None:
-    """Raise `CliError` (2) where a tuning has a deadline that could not count, as a fleet file is refused for it."""
+def check_deadline(tuning: Json, file: Json) -> None:
+    """Raise `CliError` (2) where a tuning has a deadline that could not count, as a fleet file is refused for it.
+
+    ``file``: the fleet file's tuning; the deadline that it has cannot be tuned away.
+    """
     fault = deadline_fault(ScoreForm(tuning.get("score", ScoreForm.PAPER)), shares(tuning["weights"])["cpu"])
     if tuning.get("deadline_ms") is not None and fault is not None:
-        raise CliError(EXIT_USAGE, f"{fault}: {_INSTEAD[fault]}, or deadline_ms=null; nothing was changed")
+        is_own = file.get("deadline_ms") is None
+        without = "deadline_ms=null" if is_own else "a fleet file without objective: latency and deadline_ms"
+        raise CliError(EXIT_USAGE, f"{fault}: {_INSTEAD[fault]}, or {without}; nothing was changed")
 
 
 def _own(after: Json) -> Json:
@@ -177,7 +182,7 @@ def _own(after: Json) -> Json:
     return {key: _WORDS[key](value) if key in _WORDS and value is not None else value for key, value in given.items()}
 
 
-def _file_tuning(task: Json) -> Json:
+def file_tuning(task: Json) -> Json:
     """The fleet file's tuning; a daemon of an older program does not tell it."""
     found: Json = task.get("file_tuning") or task["tuning"]
     return found
@@ -201,14 +206,14 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
                 "task": task["name"],
                 "revision": task["revision"],
                 "tuning": _flat(task["tuning"]),
-                "file": _flat(_file_tuning(task)),
+                "file": _flat(file_tuning(task)),
             }
             for task in tasks
         ]
         print_json({"schema": TUNING_SCHEMA, "tasks": found})
         return EXIT_OK
     for task in tasks:
-        by_file = _file_tuning(task)
+        by_file = file_tuning(task)
         now, file = _flat(task["tuning"]), _flat(by_file)
         file["patience"] = _file_patience(task["tuning"], by_file)
         words = [

@@ -50,9 +50,10 @@ def weights(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     task = tasks[name]
     before = shares(task["tuning"]["weights"])
     if task["tuning"].get("deadline_ms") is not None:
-        from zsched.commands.tune import check_deadline  # noqa: PLC0415 - most tasks have none, and need no rule of it
+        # most tasks have none, and need no rule of it
+        from zsched.commands.tune import check_deadline, file_tuning  # noqa: PLC0415
 
-        check_deadline({**task["tuning"], "weights": wanted})
+        check_deadline({**task["tuning"], "weights": wanted}, file_tuning(task))
     keys = [key for key in NAMES if before.get(key, 0.0) != wanted.get(key, 0.0)]
     rows: list[Row] = [(name, key, f"{before.get(key, 0.0):g}", f"{wanted.get(key, 0.0):g}") for key in keys]
     plan = {"schema": SCHEMA, "task": name, "weights": wanted, "revision": task["revision"]}

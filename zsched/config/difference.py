@@ -514,7 +514,9 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
         before, after = getattr(old.tuning, one.name), getattr(new.tuning, one.name)
         if before != after:
             key = "weights" if one.name == "weights" else f"scheduling.{one.name}"
-            yield _set(AT_ONCE, f"{path}.{key}", _plain(before), _plain(after))
+            told = _set(AT_ONCE, f"{path}.{key}", _plain(before), _plain(after))
+            objective = (f"{path}.scheduling.objective",) if one.name == "deadline_ms" else ()
+            yield replace(told, paths=(*told.paths, *objective))
     for name in TASK_RULES:
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, f"{path}.scheduling.{name}", getattr(old, name), getattr(new, name))

@@ -380,7 +380,7 @@ TASK: Final = Record(
             required=True,
         ),
         "limits": Field(LIMITS, "How far a candidate's gauges may go."),
-        "demand": Field(DEMAND, "What the task needs, before it was ever measured."),
+        "demand": Field(DEMAND, "What the task needs at least; what is measured counts where it is more."),
         "scheduling": Field(SCHEDULING, "When a better candidate is worth a move."),
         "link": Field(LINK_LIMITS, "The limits of Eq. 3."),
         "worker": Field(WORKER, "The process that does the work."),

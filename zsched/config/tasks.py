@@ -176,10 +176,11 @@ def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Coll
     """``deadline_ms`` as the tuning has it, which is the objective at the same time."""
     objective = scheduling.values.get("objective", Objective.SERVICE)
     deadline_ms: float | None = scheduling.values.get("deadline_ms")
+    is_told = "objective" in scheduling.values  # one with a fault is not there, and has been told of
     if objective is Objective.LATENCY and deadline_ms is None and scheduling.is_whole:
         message = "objective latency needs a deadline: when is a job too late?"
         out.error(scheduling.where("objective"), message, "deadline_ms: 100 (milliseconds from input to output)")
-    elif objective is Objective.SERVICE and deadline_ms is not None:
+    elif objective is Objective.SERVICE and deadline_ms is not None and (is_told or scheduling.is_whole):
         message = "deadline_ms counts for objective latency only, and this task has objective service"
         out.error(scheduling.where("deadline_ms"), message, "add objective: latency, or delete it")
     elif objective is Objective.LATENCY and (fault := deadline_fault(score, weights.cpu)) is not None:

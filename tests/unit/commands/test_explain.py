@@ -393,6 +393,7 @@ def test_a_past_that_is_not_there_is_said_with_what_there_is(past: Fleet, tmp_pa
     refusals = {
         "9": (EXIT_FAILED, "no move of merge to epoch 9; it knows epochs 4 to 5"),
         "3": (EXIT_FAILED, "no move of merge to epoch 3"),
+        "5h": (EXIT_FAILED, "no judgement of merge of 5h ago or before"),
         "1970-01-01T00:00:00Z": (EXIT_FAILED, "no judgement of merge until"),
         "yesterday": (EXIT_USAGE, "an epoch .12., an age"),
         "9" * 5000: (EXIT_USAGE, "an epoch .12., an age"),

@@ -119,6 +119,13 @@ def test_a_plan_exits_with_10_when_something_would_change_and_gives_no_order(
     assert (planned.exit_code, faults(json.loads(planned.stdout)), daemon.orders) == (code, [], [])
 
 
+@pytest.mark.parametrize("more", ["--plan", "--yes"])
+def test_no_task_is_pinned_to_a_node_that_is_no_candidate(daemon: Daemon, more: str) -> None:
+    result = run("pin", "echo", "robot1", more)
+    assert (result.exit_code, daemon.orders) == (1, [])
+    assert "echo: invalid: 'robot1' is no candidate; there are edge1, edge2" in result.stderr
+
+
 def test_a_pause_carries_who_why_and_how_long_and_is_listed(daemon: Daemon) -> None:
     result = run("pause", "echo", "-m", "new lens", "--for", "2h", "--yes")
     assert result.exit_code == 0, result.output
@@ -530,7 +537,13 @@ def test_a_deadline_that_could_not_count_is_refused_as_the_fleet_file_refuses_it
         result = run(verb, "echo", "cpu=0", "memory=1", "--yes")
         assert (result.exit_code, daemon.orders) == (2, [])
         assert "this task gives the CPU no weight" in result.stderr
+        assert "or deadline_ms=null" in result.stderr
     assert run("tune", "echo", "cpu=0", "memory=1", "deadline_ms=null", "--yes").exit_code == 0
+    daemon.status["tasks"][0]["file_tuning"] = {**TUNING, "deadline_ms": 100.0}
+    for verb, words in (("tune", ("score=paper", "deadline_ms=null")), ("weights", ("cpu=0", "memory=1"))):
+        result = run(verb, "echo", *words, "--yes")
+        assert result.exit_code == 2
+        assert "or a fleet file without objective: latency and deadline_ms" in result.stderr, "null is the file's"
 
 
 def test_a_deadline_of_a_worker_that_tells_nothing_is_tuned_with_a_word(daemon: Daemon) -> None:

@@ -158,6 +158,7 @@ def test_workers_take_a_new_process_for_all_that_a_process_keeps() -> None:
     late = with_("cool_down_s: 2}", "cool_down_s: 2, objective: latency, deadline_ms: 80}")
     (told,) = (one for one in changes(late) if one.path.endswith("deadline_ms"))
     assert (told.effect, told.after) == (Effect.WORKERS, "80")
+    assert not [one.path for one in changes(late) if one.effect is Effect.NOTHING]
     by_hand = with_("      command: [python, -m, zsched.tasks.map_merge, --mode, estimate]\n", "      link: peer\n")
     other = with_("link: peer", "link: client", by_hand)
     assert [one.consequence for one in changes(other, by_hand)] == [

@@ -218,6 +218,7 @@ def test_a_task_s_objective_is_part_of_what_is_agreed(
         ("{objective: latency, deadline_ms: 80, score: paper}", ("the paper's score knows no deadlines",)),
         ("{objective: latency, deadline_ms: 0}", ("0 is not in the allowed range 1..3600000 ms",)),
         ("{objective: speed}", ("objective", "speed")),
+        ("{objective: latencey, deadline_ms: 80}", ("objective", "latencey")),
     ],
 )
 def test_half_an_objective_is_a_fault_that_says_what_is_missing(given: str, words: tuple[str, ...]) -> None:
