@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from support.fleets import fleet_of, task_of, tuning_of
 from support.plays import EDGES, TASK, Play
 from zsched.core.values.document import Flag, FlagKind
+from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim import missed_electors
 from zsched_lab.sim.missed_electors import ROBOTS, moves, working
 from zsched_lab.sim.simulator import Simulator
@@ -47,6 +49,35 @@ def test_the_owner_is_left_and_does_not_get_the_task_back(down_s: float, of_s: f
     at_work, moved = played(down_s, of_s, within_s + 60.0)
     assert moved == 1
     assert set(at_work[round(within_s / 0.1) :]) == {"edge2"}
+
+
+@pytest.mark.parametrize(
+    ("robots", "is_cut", "owner"),
+    [(("robot1",), True, "robot1"), (("robot1",), False, "edge1"), (("robot1", "robot2"), True, "edge1")],
+)
+def test_the_only_robot_does_its_task_itself_where_no_stream_reaches_the_edge(
+    robots: tuple[str, ...], owner: str, *, is_cut: bool
+) -> None:
+    """It gave the task away, and nobody did it any more. Where another robot may reach the edge it cannot tell."""
+    task = task_of(
+        candidates=("robot1", "edge1"),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        worker=WorkerSpec(command=("work",)),
+        patience=0.15,
+    )
+    fleet = fleet_of(task, of=(*robots, "edge1"))
+    busy = {"robot1": 2.4}
+    load = lambda node, at: (busy.get(node, 0.2) if at > 130.0 else 0.2, 1000.0)  # noqa: E731
+    sim = Simulator(fleet=fleet, seed=1, load=load)
+    if is_cut:
+        sim.data_cuts.update((("robot1", "edge1"), ("edge1", "robot1")))
+    sim.start(*robots)
+    sim.run(6.0)
+    sim.start()
+    sim.run(20.0)
+    assert sim.agreed(task.name) == "robot1"
+    sim.run(60.0)
+    assert sim.agreed(task.name) == owner
 
 
 @pytest.mark.long

@@ -326,6 +326,11 @@ class Stages:
         """{candidate: its fresh profile} of the living ones, this node left out, and those that take nothing new."""
         return {name: profile for name, profile in self._heard(spec, now) if name not in self.flags.closed}
 
+    def _is_enough(self, spec: TaskSpec) -> bool:
+        """Whether this robot can do the task itself, and no other one shares it."""
+        is_ready = self.worker_states.get(spec.name) is WorkerState.READY
+        return is_ready and self.me in spec.candidates and tuple(self.rounds.voters) == (self.me,)
+
     def _heard(self, spec: TaskSpec, now: float) -> Iterator[tuple[NodeId, Profile]]:
         """The other living candidates with a fresh profile."""
         for name in spec.candidates:
@@ -379,11 +384,18 @@ class Stages:
             self.rested.hear(spec.name, told, now, is_explained=owner in leaseless)
         unfit = self._with_rested(spec, leaseless, now) if needs_lease else {}
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
-        ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
+        ready = [name for name, load in loads if load is not None and load.state is WorkerState.READY]
         left = frozenset(self.flags.drained)
         stays = None if owner in left or (told is not None and told.draining) else owner
         unseen = self.unseen.look(
-            spec, ready, self.probation, now, self.fleet.timing.decide_s, owner=stays, is_ours=stays == self.me
+            spec,
+            ready,
+            self.probation,
+            now,
+            self.fleet.timing.decide_s,
+            owner=stays,
+            is_ours=stays == self.me,
+            is_enough=self._is_enough(spec),
         )
         if owner is not None and self.rounds.tasks[spec.name].judge.is_overdue(now):
             left |= {owner}

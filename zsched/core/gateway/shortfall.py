@@ -5,7 +5,8 @@ Knows: forecasts of work and of jobs' ages, what came of them. Does not know: ho
 The owner's service is measured, the candidates' foretold. So what a machine did not keep is remembered of it for as
 long as others use about as much there. Otherwise it would look better as soon as the task has left, and the task go
 there and back for ever (docs/decisions/0032). Where no wait for CPU explains it (the worker was stuck once, a disk is
-slow for good), it is remembered for a minute, and twice as long each time that it is seen again (0135).
+slow for good), it is remembered for a minute, and twice as long each time that it is seen again (0135). A wait beside
+nobody (a quota, a clock that is held down against heat) is remembered for an hour: no end of anybody's use shows its.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import math
 from collections.abc import Container
 from typing import Final
 
-from zsched.core.doubt import Doubt
+from zsched.core.doubt import LONGEST_DOUBT_S, Doubt
 from zsched.core.gateway.company import Company, is_full
 from zsched.core.gateway.job_need import JobNeed
 from zsched.core.values.model import NodeId, TaskId
@@ -56,6 +57,8 @@ class Shortfalls:
         self._seen: dict[tuple[TaskId, NodeId], _Shortfall] = {}
         self._foretold: dict[TaskId, _Foretold] = {}
         self._doubts: dict[tuple[TaskId, NodeId], Doubt] = {}
+        self._alone_at: dict[tuple[TaskId, NodeId], float] = {}
+        """When such a wait was seen last beside next to nobody."""
 
     def note(
         self,
@@ -96,13 +99,20 @@ class Shortfalls:
                 doubt.keep(now)
             return before is not None
         is_explained = _waits(load, profile)
+        if is_explained and company.is_next_to_nobody(profile):
+            self._alone_at[task, profile.node] = now
+        else:
+            self._alone_at.pop((task, profile.node), None)
         if not is_explained:
             self._doubts.setdefault((task, profile.node), Doubt(seen_at=now)).see(now)
         self._seen[task, profile.node] = _Shortfall(share, stretch, company, is_explained)
         return before != self._seen[task, profile.node]
 
     def end_doubts(self, task: TaskId, now: float) -> None:
-        """Forget what nothing explains and was not seen for long enough."""
+        """Forget what nothing explains, or nobody who is there, and was not seen for long enough."""
+        for key in [key for key, at in self._alone_at.items() if key[0] == task and now - at >= LONGEST_DOUBT_S]:
+            del self._alone_at[key]
+            self._seen.pop(key, None)
         unexplained = [key for key, one in self._seen.items() if key[0] == task and not one.is_explained]
         for key in unexplained:
             if self._doubts[key].is_over(now):
@@ -129,12 +139,14 @@ class Shortfalls:
         """Know nothing of other nodes."""
         self._seen = {key: seen for key, seen in self._seen.items() if key[1] in nodes}
         self._doubts = {key: doubt for key, doubt in self._doubts.items() if key[1] in nodes}
+        self._alone_at = {key: at for key, at in self._alone_at.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
         self._foretold.pop(task, None)
         self._seen = {key: seen for key, seen in self._seen.items() if key[0] != task}
         self._doubts = {key: doubt for key, doubt in self._doubts.items() if key[0] != task}
+        self._alone_at = {key: at for key, at in self._alone_at.items() if key[0] != task}
 
 
 def _waits(load: WorkerLoad, profile: Profile) -> bool:

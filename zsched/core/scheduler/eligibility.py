@@ -108,6 +108,18 @@ def is_for_comers(reason: str) -> bool:
     return reason.startswith(_NEEDS) or _BACK in reason
 
 
+def is_far_beyond(spec: TaskSpec, gauges: Mapping[GaugeName, float]) -> bool:
+    """Whether an owner is beyond a limit by more than its margin: a machine just inside is better, and not for long.
+
+    Whatever is nearer to the limit than that would soon be left for it again.
+    """
+    return any(
+        BY_NAME[name].is_far_beyond(gauges.get(name), limit)
+        for name, limit in spec.gauge_limits
+        if name != "gpu" or spec.demand.gpu
+    )
+
+
 def is_of_machine(reason: str) -> bool:
     """Whether a refusal says what the machine lacks: memory, or a gauge within its limit.
 

@@ -97,6 +97,13 @@ class Judge:
         if is_new_owner:
             self.lost, self.absences = Absences(), _of_worker()
 
+    def by(self, spec: TaskSpec) -> None:
+        """Judge by other settings; by another start-up time what was away in the one before does not count."""
+        if spec.worker.start_deadline_s != self.spec.worker.start_deadline_s:
+            since = self.absences.since
+            self.absences = _of_worker(None if since is None else since + self.held_s)
+        self.spec = spec
+
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
 

@@ -93,7 +93,8 @@ class TaskRound:
 
     def _judge_by(self, spec: TaskSpec) -> None:
         if spec != self.spec:
-            self.spec = self.judge.spec = spec
+            self.spec = spec
+            self.judge.by(spec)
             self.rules = rules_of(spec)
 
     def by(self, spec: TaskSpec) -> TaskRound:

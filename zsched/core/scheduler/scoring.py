@@ -13,7 +13,7 @@ from collections.abc import Set as AbstractSet
 from zsched.core.gateway.demand import Demands
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
-from zsched.core.scheduler.eligibility import has_living_owner, may_return, refusal
+from zsched.core.scheduler.eligibility import has_living_owner, is_far_beyond, may_return, refusal
 from zsched.core.scheduler.links import PairLink, pair_link, ways
 from zsched.core.scheduler.usage import Bookings, Use, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
@@ -183,6 +183,7 @@ class _View:
             and has_living_owner(spec, states.get(owner, PeerState.UNKNOWN), told, is_spared=owner in doubts.in_grace)
         )
         is_kept = has_owner and owner not in doubts.left and may_return(spec, told)
+        is_within = told is None or not is_far_beyond(spec, gateway.readings(told))
         of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
         margin_db = own_margin_db = 0.0
         if is_kept and allocation.tuning.score is ScoreForm.SERVICE:
@@ -191,7 +192,7 @@ class _View:
             own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
         self._owner = owner if has_owner else None
         """Who has the task, works, or may, and may keep it; ``None``: nobody."""
-        self._is_kept = is_kept
+        self._is_kept = is_kept and is_within
         self._of_owner, self._margin_db, self._own_margin_db = of_owner, margin_db, own_margin_db
 
     def terms(self, candidate: NodeId, network_s: float) -> _Terms | str | None:
@@ -207,7 +208,15 @@ class _View:
         gauges = predicted_gauges(spec, allocation, profile, self._bookings, gateway, now)
         needed = demand if is_comer else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
-        if reason := refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, is_kept=self._is_kept):
+        if reason := refusal(
+            spec,
+            allocation,
+            profile,
+            needed.memory_mb,
+            least_use,
+            gauges,
+            is_kept=self._is_kept and candidate != allocation.home,
+        ):
             return reason
         link = self._link(candidate)
         if link is not None and not link.is_reached:

@@ -6,9 +6,10 @@ Knows: whose worker is ready by its node's profile, which workers' tokens our re
 Control and streams travel on ports of their own. Where a firewall lets the one through and not the other, a node beats,
 answers and scores as any other, and no stream reaches its worker. A robot says so when such a worker has been ready and
 unseen for `UNSEEN_S`, while the worker of another candidate is seen: then our own relay's links work, and there is a
-better place. By the task's `reach` such a candidate gets nothing, and an owner is left. One that is unseen again and
-again has that time in all (`zsched.core.absence`). Nor does it get the task between two absences, while that has an
-owner which is seen and does not come and go.
+better place. Where this robot is a candidate itself, with a ready worker, and no other one shares the task, its own
+place is as good as one that is seen. By the task's `reach` such a candidate gets nothing, and an owner is left. One
+that is unseen again and again has that time in all (`zsched.core.absence`). Nor does it get the task between two
+absences, while that has an owner which is seen and does not come and go.
 
 Workers that show no token before they own the task say nothing here.
 """
@@ -64,6 +65,7 @@ class Unseen(Struct):
         *,
         owner: NodeId | None = None,
         is_ours: bool = False,
+        is_enough: bool = False,
     ) -> frozenset[NodeId]:
         """The candidates that no stream reaches, as far as it can be told.
 
@@ -75,12 +77,13 @@ class Unseen(Struct):
             period_s: the longest time between two looks, while all is well.
             owner: who has the task, and may keep it.
             is_ours: that is this node, which needs no token.
+            is_enough: this node could have it, too, and no other robot wants it: any other place must be seen.
         """
         if now - self._looked_at > max(LONGEST_GAP_S, 2.0 * period_s):
             self._absences.clear()
         self._looked_at = now
         is_seen = {name: tokens.sees(name, spec.name) for name in ready} if shows_token(spec) else {}
-        missed = [name for name, seen in is_seen.items() if not seen] if any(is_seen.values()) else []
+        missed = [name for name, seen in is_seen.items() if not seen] if is_enough or any(is_seen.values()) else []
         absences = self._absences.setdefault(spec.name, {})
         for name in missed:
             absences.setdefault(name, Absences())

@@ -56,6 +56,15 @@ class Gauge(Struct, frozen=True, kw_only=True):
         """The reading from which on a machine beyond the limit may get the task (again), within what it can read."""
         return min(max(limit + (self.margin if self.is_floor else -self.margin), self.low), self.high)
 
+    def is_far_beyond(self, reading: float | None, limit: float) -> bool:
+        """Whether a reading is beyond the limit by more than the margin.
+
+        >>> [GAUGES[1].is_far_beyond(reading, 0.2) for reading in (None, 0.3, 0.16, 0.14)]
+        [False, False, False, True]
+        """
+        beyond = 0.0 if reading is None else limit - reading if self.is_floor else reading - limit
+        return beyond > self.margin
+
     def fault(
         self, reading: float | None, limit: float, *, has_margin: bool, is_reckoned: bool = False, is_old: bool = False
     ) -> str:

@@ -152,8 +152,8 @@ def test_a_time_in_which_the_task_was_elsewhere_proves_nothing() -> None:
 @pytest.mark.parametrize(
     ("jobs", "wanted", "others", "is_for_good"),
     [
-        (HELD_UP, None, 0.0, True),
-        (STUCK, 0.8, 0.0, True),
+        (HELD_UP, None, 1.0, True),
+        (STUCK, 0.8, 1.0, True),
         (STUCK, 0.4, 0.0, False),
         (STUCK, None, 3.6, False),
         (replace(STUCK, wait_s=None), 0.4, 3.6, False),
@@ -182,15 +182,27 @@ def test_where_the_kernel_does_not_tell_who_waits_a_full_machine_is_the_cause(ot
 @pytest.mark.parametrize(("wait_s", "is_for_good"), [(0.0199, False), (0.0201, True)])
 def test_a_tenth_of_a_job_s_time_is_a_wait(wait_s: float, *, is_for_good: bool) -> None:
     shortfalls = Shortfalls()
-    noted(shortfalls, of_stuck(jobs=replace(STUCK, wait_s=wait_s)), 0.2)
-    assert is_held(shortfalls, 1e6) is is_for_good
+    noted(shortfalls, of_stuck(jobs=replace(STUCK, wait_s=wait_s), others=1.0), 0.2)
+    assert is_held(shortfalls, 1e6, of_stuck(cores=0.0, others=1.0)) is is_for_good
+
+
+def test_a_wait_beside_nobody_is_held_against_its_machine_for_an_hour() -> None:
+    """A quota that somebody sets for a moment: no end of others' use would ever tell that it is gone."""
+    alone, others = of_stuck(jobs=HELD_UP, others=0.3), of_stuck(jobs=HELD_UP, others=0.41)
+    for first, last, ends in ((alone, alone, True), (alone, others, False), (others, alone, True)):
+        shortfalls = Shortfalls()
+        noted(shortfalls, first, 0.2, now=0.0)
+        noted(shortfalls, last, 0.2, now=10.0)
+        left = of_stuck(cores=0.0, others=0.3)
+        assert is_held(shortfalls, 9.9 + LONGEST_DOUBT_S, left)
+        assert is_held(shortfalls, 10.0 + LONGEST_DOUBT_S, left) is not ends
 
 
 def test_what_a_wait_explains_stays_while_a_doubt_of_another_time_ends() -> None:
     shortfalls = Shortfalls()
     noted(shortfalls, of_stuck(), 0.2, now=0.0)
-    noted(shortfalls, of_stuck(jobs=HELD_UP), 0.2, now=1.0)
-    assert is_held(shortfalls, 1e6)
+    noted(shortfalls, of_stuck(jobs=HELD_UP, others=1.0), 0.2, now=1.0)
+    assert is_held(shortfalls, 1e6, of_stuck(cores=0.0, others=1.0))
 
 
 def test_of_a_task_or_a_node_that_is_no_more_nothing_is_remembered() -> None:

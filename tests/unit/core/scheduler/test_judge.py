@@ -556,6 +556,24 @@ def reason(
 
 
 DEADLINE_S = SPEC.worker.start_deadline_s
+
+
+@pytest.mark.parametrize("is_away", [False, True])
+def test_by_another_start_up_time_former_absences_do_not_count(*, is_away: bool) -> None:
+    """Two starts of 100 s, of 120 s that it had, made the next one an escape at once when the document gave it 20 s."""
+    judge = Judge(spec=replace(SPEC, worker=replace(SPEC.worker, start_deadline_s=120.0)))
+    for begins in (0.0, 200.0):
+        judge.not_ready_for(profile(state=WorkerState.STARTING), begins)
+        if begins == 0.0 or not is_away:
+            judge.not_ready_for(profile(), begins + 100.0)
+    former_s = judge.not_ready_for(profile(state=WorkerState.STARTING), 300.0)
+    judge.by(replace(judge.spec, patience=3.0))
+    assert judge.not_ready_for(profile(state=WorkerState.STARTING), 301.0) == former_s + 1.0
+    judge.by(SPEC)
+    assert (judge.spec, judge.held_s) == (SPEC, 0.0)
+    assert judge.not_ready_for(profile(state=WorkerState.STARTING), 302.0) == (102.0 if is_away else 2.0)
+
+
 FOREIGN = task_of(candidates=SPEC.candidates, tuning=TUNING)
 
 

@@ -18,8 +18,10 @@ from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
+    Asked,
     PairReading,
     PeerState,
+    Pin,
     Reach,
     ScoreForm,
     Tuning,
@@ -937,3 +939,32 @@ def test_a_node_comes_back_inside_the_margin_only() -> None:
     vector = scored(gauged("edge2", battery=0.22), gauged("edge3", battery=0.25), spec=spec)
     assert dict(vector.refused)["edge2"] == "battery is at 22 %, limit 20 %, back from 25 % on"
     assert [one.candidate for one in vector.utilities] == ["edge3"]
+
+
+@pytest.mark.parametrize(("battery", "is_refused"), [(0.16, True), (0.14, False)])
+def test_from_an_owner_far_beyond_its_limit_a_task_goes_inside_the_margin_too(
+    battery: float, *, is_refused: bool
+) -> None:
+    """It stayed on a robot at 2 % for one at 24 %."""
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
+    vector = scored(gauged("edge1", battery=battery), gauged("edge2", battery=0.22), spec=spec)
+    assert "edge1" in dict(vector.refused)
+    assert ("edge2" in dict(vector.refused)) == is_refused
+    assert "edge3" in dict(scored(gauged("edge1", battery=battery), gauged("edge3", battery=0.19), spec=spec).refused)
+
+
+def test_a_gpu_that_may_be_busy_with_the_task_alone_is_never_far_beyond_its_limit() -> None:
+    spec = replace(SPEC, gauge_limits=(("gpu", 0.6),))
+    told = gauged("edge1", gpu=0.9), gauged("edge2", gpu=0.55)
+    assert "edge2" in dict(scored(*told, spec=spec).refused)
+    known = replace(spec, demand=Demand(gpu=0.02))
+    assert "edge2" not in dict(scored(*told, spec=known).refused)
+
+
+def test_a_node_to_which_the_task_is_pinned_needs_no_margin() -> None:
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
+    told = gauged("edge2", battery=0.22), gauged("edge3", battery=0.22)
+    asked = Asked(by="ada@robot1")
+    pinned = replace(allocation(), pin=Pin(asked=asked, node="edge2", revision=1))
+    refused = dict(scored(*told, spec=spec, agreed=pinned).refused)
+    assert ("edge2" in refused, "edge3" in refused) == (False, True)

@@ -26,7 +26,7 @@ class Robot:
         self.tokens = Probation(fleet_of(TASK, OTHER, of=TASK.candidates, electors=("edge1",)))
         self.unseen, self.period_s = Unseen(), STEP_S
         self.owner: str | None = "edge2"
-        self.is_ours = False
+        self.is_ours = self.is_enough = False
         for name in seen:
             self.show(name)
 
@@ -35,7 +35,14 @@ class Robot:
 
     def look(self, *ready: str) -> set[str]:
         found = self.unseen.look(
-            self.spec, ready or EDGES, self.tokens, self.now, self.period_s, owner=self.owner, is_ours=self.is_ours
+            self.spec,
+            ready or EDGES,
+            self.tokens,
+            self.now,
+            self.period_s,
+            owner=self.owner,
+            is_ours=self.is_ours,
+            is_enough=self.is_enough,
         )
         return set(found)
 
@@ -57,6 +64,13 @@ def test_a_ready_worker_that_is_not_seen_beside_one_that_is_is_told_after_its_ti
 def test_a_robot_that_sees_nobody_s_worker_blames_nobody() -> None:
     assert Robot().pass_time(60.0) == set()
     assert Robot("edge1", "edge2").pass_time(60.0) == set()
+
+
+def test_a_robot_that_can_do_the_task_alone_leaves_it_to_nobody_whom_it_does_not_see() -> None:
+    robot = Robot()
+    robot.is_enough = True
+    assert robot.pass_time(UNSEEN_S - 0.01) == set()
+    assert robot.pass_time(0.01) == {"edge1", "edge2"}
 
 
 def test_the_worker_of_another_task_is_no_sight_of_this_one_s() -> None:
