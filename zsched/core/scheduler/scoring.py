@@ -208,15 +208,7 @@ class _View:
         gauges = predicted_gauges(spec, allocation, profile, self._bookings, gateway, now)
         needed = demand if is_comer else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
-        if reason := refusal(
-            spec,
-            allocation,
-            profile,
-            needed.memory_mb,
-            least_use,
-            gauges,
-            is_kept=self._is_kept and candidate != allocation.home,
-        ):
+        if reason := refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, is_kept=self._is_kept):
             return reason
         link = self._link(candidate)
         if link is not None and not link.is_reached:

@@ -18,10 +18,8 @@ from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import (
     Allocation,
-    Asked,
     PairReading,
     PeerState,
-    Pin,
     Reach,
     ScoreForm,
     Tuning,
@@ -959,12 +957,3 @@ def test_a_gpu_that_may_be_busy_with_the_task_alone_is_never_far_beyond_its_limi
     assert "edge2" in dict(scored(*told, spec=spec).refused)
     known = replace(spec, demand=Demand(gpu=0.02))
     assert "edge2" not in dict(scored(*told, spec=known).refused)
-
-
-def test_a_node_to_which_the_task_is_pinned_needs_no_margin() -> None:
-    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
-    told = gauged("edge2", battery=0.22), gauged("edge3", battery=0.22)
-    asked = Asked(by="ada@robot1")
-    pinned = replace(allocation(), pin=Pin(asked=asked, node="edge2", revision=1))
-    refused = dict(scored(*told, spec=spec, agreed=pinned).refused)
-    assert ("edge2" in refused, "edge3" in refused) == (False, True)
