@@ -975,6 +975,22 @@ def test_a_task_whose_worker_somebody_else_starts_rests_where_machines_are_alike
     assert loop.run(150.0) == []
 
 
+@pytest.mark.parametrize(
+    ("cores", "base", "need", "told", "others"),
+    [(2.0, 0.0, 2.2, 2.2, 0.0), (4.0, 0.0, 4.4, 4.0, 0.0), (4.0, 0.5, 3.0, 3.0, 2.0), (4.0, 0.5, 3.9, 3.1, 2.0)],
+)
+def test_a_foreign_worker_that_is_too_large_for_machines_that_are_alike_rests(
+    cores: float, base: float, need: float, told: float, others: float
+) -> None:
+    """Those of its threads that wait for each other were taken for others', and it fled from itself: 31 moves."""
+    machine = Machine(name="edge1", cores=cores, base=base, memory=0.2, threads=others, task_cores=need)
+    machine = replace(machine, shows_worker=False)
+    machines = (machine, replace(machine, name="edge2"))
+    demand = Demand(cpu_cores=told)
+    moves = Loop(machines, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True, demand=demand).run(150.0)
+    assert len(moves) <= 1, "where it began nobody had seen the machine without it"
+
+
 @pytest.mark.parametrize("hidden_mb", [1400.0, 1900.0])
 def test_memory_that_a_worker_holds_and_does_not_show_counts_once(hidden_mb: float) -> None:
     """A GPU's on a board where that is the machine's memory; the fleet file says what the task needs of it."""

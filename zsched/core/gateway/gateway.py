@@ -113,6 +113,11 @@ class Gateway:
         if self.demands.is_replaced(task, profile):
             self.forget(task)
         has_share = self._shares.learn(task, profile, now)
+        load = profile.worker(task)
+        if load is None or load.cpu_cores is None:  # nobody measures it
+            for one in (self.fresh(name, now) for name in candidates if name != owner):
+                if one is not None:
+                    self._shares.look_elsewhere(task, one, now)
         for name in self._shares.left_by(task, owner):
             left = self.fresh(name, now)
             has_share |= left is not None and self._shares.look_back(task, left, now)
@@ -140,6 +145,10 @@ class Gateway:
     def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
         """The task's demand on the node of ``profile``."""
         return self.demands.at(spec, profile)
+
+    def beside_unmeasured(self, spec: TaskSpec, profile: Profile, need_cores: float) -> tuple[float, float] | None:
+        """(its threads, others') where a worker is at work that nobody measures (`zsched.core.gateway.sharing`)."""
+        return self._shares.beside_unmeasured(spec.name, profile, need_cores)
 
     def share(self, spec: TaskSpec, profile: Profile, need_cores: float, coming_cores: float) -> float:
         """Cores that the task would get on the node of ``profile``, were it full (`zsched.core.gateway.sharing`)."""

@@ -15,7 +15,7 @@ than the task would find there, so how many more they were is remembered, too (d
 from __future__ import annotations
 
 from collections.abc import Container
-from typing import Final
+from typing import Final, Self
 
 from zsched.core.gateway.company import SAME_RATIO, STARVED_CPU_RATIO, is_full, others_cores
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
@@ -26,6 +26,10 @@ from zsched.core.values.struct import Struct, replace
 
 ENDED_S: Final = 60.0
 """Others that do not fill a machine any more for this time have ended."""
+SHOWN_S: Final = 4.0
+"""By this time a machine's threads show a task that has come; the same as `zsched.core.gateway.demand.SETTLE_S`."""
+COUNTED_S: Final = 8.0
+"""For so long they are counted; what comes later is others'."""
 LEFT_S: Final = 4.0
 """Others show what they do without the task for this time after its worker has stopped working there."""
 
@@ -79,6 +83,24 @@ class _Others(Struct, frozen=True):
         return seen if self.left_at is None else max(seen, min(seen + self.more, self.beside))
 
 
+class _Unmeasured(Struct, frozen=True):
+    """A worker of which nobody measures anything, on its owner."""
+
+    others: float | None
+    """Threads that ran or waited there before it came; ``None``: nobody has seen that."""
+    since: float
+    own: float | None = None
+    """How many more there are since, on the mean of the first seconds in which they show; ``None``: not known."""
+    looks: int = 0
+
+    def look(self, runnable: float, now: float) -> Self:
+        """With one more figure of the machine."""
+        if self.others is None or not SHOWN_S <= now - self.since < SHOWN_S + COUNTED_S:
+            return self
+        more, looks = max(runnable - self.others, 0.0), self.looks + 1
+        return replace(self, own=((self.own or 0.0) * self.looks + more) / looks, looks=looks)
+
+
 class Shares:
     """One node's experience of what tasks get of full machines."""
 
@@ -86,6 +108,11 @@ class Shares:
         self._others: dict[tuple[TaskId, NodeId], _Others] = {}
         self._threads: dict[TaskId, float] = {}
         """How many of a task's threads wanted to run where it lacked CPU last."""
+        self._without: dict[tuple[TaskId, NodeId], float] = {}
+        """Threads that run or wait on machines where a task is not that nobody measures."""
+        self._unmeasured: dict[tuple[TaskId, NodeId], _Unmeasured] = {}
+        self._left_at: dict[tuple[TaskId, NodeId], float] = {}
+        """When such a task was first seen to have another owner."""
         self._got: dict[tuple[TaskId, NodeId], _Got] = {}
 
     def learn(self, task: TaskId, profile: Profile, now: float) -> bool:
@@ -94,19 +121,59 @@ class Shares:
         A worker that starts does other work, by other threads: that tells nothing of the task.
         """
         load, key, used = profile.worker(task), (task, profile.node), others_cores(task, profile)
+        has_changed = self._look_unmeasured(key, profile, now)
         if load is None or load.state is not WorkerState.READY or profile.runnable is None or used is None:
-            return False
+            return has_changed
         is_lacking = _is_hungry(load) or _is_held_up(profile, load)
         threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
         own = threads if is_lacking and load.runnable is None else threads_of(load)
         others = max(profile.runnable - own, 0.0)
         self._others[key] = _Others(others, used, own, profile.cpu_cores, now)
         if load.cpu_cores is None or not is_lacking:
-            return False
+            return has_changed
         kept = min(load.cpu_cores / fair_share(profile.cpu_cores, threads, others), 1.0)
         before, got = self._got.get(key), _Got(threads, kept, profile.cpu_cores)
         self._threads[task], self._got[key] = threads, got
         return before != got
+
+    def _look_unmeasured(self, key: tuple[TaskId, NodeId], profile: Profile, now: float) -> bool:
+        """Note how many threads came with a worker that nobody measures; whether that has changed."""
+        load = profile.worker(key[0])
+        is_at_work = load is None or (load.state is WorkerState.READY and load.cpu_cores is None)
+        if profile.runnable is None or not is_at_work:
+            return False
+        before = self._unmeasured.get(key)
+        if before is None:
+            before = _Unmeasured(self._without.get(key), now)
+        self._unmeasured[key] = found = before.look(profile.runnable, now)
+        return found.own != before.own
+
+    def look_elsewhere(self, task: TaskId, profile: Profile, now: float) -> None:
+        """Note how many threads want to run where the task is not; for some seconds it may still be there, unseen."""
+        key = (task, profile.node)
+        known = self._unmeasured.get(key)
+        if known is not None:
+            left_at = self._left_at.setdefault(key, now)
+            if now - left_at <= LEFT_S:
+                return
+            del self._unmeasured[key]
+        self._left_at.pop(key, None)
+        if profile.runnable is not None:
+            self._without[key] = profile.runnable
+
+    def beside_unmeasured(self, task: TaskId, profile: Profile, need_cores: float) -> tuple[float, float] | None:
+        """(the task's threads, others') on its owner, of a worker that nobody measures; ``None``: nobody counts them.
+
+        ``need_cores``: so many threads it has at least, for all that is known.
+        """
+        if profile.runnable is None:
+            return None
+        known = self._unmeasured.get((task, profile.node))
+        own = max(need_cores, 0.0 if known is None or known.own is None else known.own)
+        others = max(profile.runnable - own, 0.0)
+        if known is not None and known.own is None and known.others is not None:
+            others = min(others, known.others)  # it has just come: who else wants to run is not seen yet
+        return own, others
 
     def left_by(self, task: TaskId, owner: NodeId) -> tuple[NodeId, ...]:
         """The nodes on which the task was, but for its ``owner``."""
@@ -161,12 +228,18 @@ class Shares:
 
     def keep(self, nodes: Container[NodeId]) -> None:
         """Know nothing of other nodes: one of the same name that comes later is another one."""
+        self._without = {key: seen for key, seen in self._without.items() if key[1] in nodes}
+        self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[1] in nodes}
+        self._left_at = {key: at for key, at in self._left_at.items() if key[1] in nodes}
         self._got = {key: got for key, got in self._got.items() if key[1] in nodes}
         self._others = {key: others for key, others in self._others.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
         self._threads.pop(task, None)
+        self._without = {key: seen for key, seen in self._without.items() if key[0] != task}
+        self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[0] != task}
+        self._left_at = {key: at for key, at in self._left_at.items() if key[0] != task}
         self._got = {key: got for key, got in self._got.items() if key[0] != task}
         self._others = {key: others for key, others in self._others.items() if key[0] != task}
 

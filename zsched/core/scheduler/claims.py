@@ -46,7 +46,7 @@ def taken(
         profile = gateway.fresh(candidate, now)
         if profile is None:
             continue
-        own = own_use(spec, values[spec.name], profile, spec.demand)
+        own = own_use(spec, values[spec.name], profile, spec.demand, gateway)
         use = predicted(profile, own, spec.demand, coming_use(spec, profile, bookings, gateway, now, own))
         if why := lacks_memory(profile, spec.demand.memory_mb, use):
             others = ", ".join(sorted(name for name, node in coming.items() if node == candidate))

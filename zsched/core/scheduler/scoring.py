@@ -202,7 +202,7 @@ class _View:
             return found
         spec, allocation, gateway, now, profile = self._spec, self._allocation, self._gateway, self._now, found
         demand, is_comer = gateway.demand(spec, profile), self._owner is not None and candidate != self._owner
-        own = own_use(spec, allocation, profile, demand)
+        own = own_use(spec, allocation, profile, demand, gateway)
         coming = coming_use(spec, profile, self._bookings, gateway, now, None if is_comer else own)
         use = predicted(profile, own, demand, coming)
         gauges = predicted_gauges(spec, allocation, profile, self._bookings, gateway, now)

@@ -108,7 +108,7 @@ def predicted(profile: Profile, own: Demand, demand: Demand, coming: Demand) -> 
     )
 
 
-def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand) -> Demand:
+def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, gateway: Gateway) -> Demand:
     """What of a node's use is the task's own.
 
     Nobody measures a worker that somebody else started. At the owner its demand is taken for its use, or the owner
@@ -120,21 +120,22 @@ def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: De
     cpu, memory = (None, None) if load is None else (load.cpu_cores, load.memory_mb)
     is_at_work = profile.node == allocation.owner and (load is None or load.state is WorkerState.READY)
     if cpu is None:
-        cpu = _likely_cores(profile, load, demand) if is_at_work else 0.0
+        cpu = _likely_cores(spec, profile, load, demand, gateway) if is_at_work else 0.0
     if is_at_work and (memory is None or allocation.tuning.score is ScoreForm.SERVICE):
         memory = max(memory or 0.0, min(profile.memory_used_mb or 0.0, demand.memory_mb))
     return Demand(cpu_cores=cpu, memory_mb=memory or 0.0)
 
 
-def _likely_cores(profile: Profile, load: WorkerLoad | None, demand: Demand) -> float:
+def _likely_cores(spec: TaskSpec, profile: Profile, load: WorkerLoad | None, demand: Demand, gateway: Gateway) -> float:
     """What a worker without a figure uses at the owner: its demand, as far as the machine gives it that."""
     use = profile.cpu_used_cores or 0.0
     if load is not None and load.jobs is not None and is_short(load):
         return min(load.jobs.done_hz * load.jobs.cpu_s, use)
-    if profile.runnable is None:
+    threads = gateway.beside_unmeasured(spec, profile, demand.cpu_cores)
+    if threads is None:
         return min(demand.cpu_cores, use)
-    others = max(profile.runnable - demand.cpu_cores, 0.0)
-    return min(demand.cpu_cores, use, fair_share(profile.cpu_cores, max(demand.cpu_cores, 1.0), others))
+    own, others = threads
+    return min(demand.cpu_cores, use, fair_share(profile.cpu_cores, max(own, 1.0), others))
 
 
 def _coming_gpu(spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float) -> float:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
-from zsched.core.gateway.sharing import ENDED_S, LEFT_S, Shares, fair_share
+from zsched.core.gateway.sharing import COUNTED_S, ENDED_S, LEFT_S, SHOWN_S, Shares, fair_share
 from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 
 
@@ -296,3 +296,88 @@ def test_a_share_is_no_more_than_there_is_or_than_the_threads_can_use_and_falls_
     assert 0.0 < share <= min(capacity, threads) * (1 + 1e-9)
     assert fair_share(capacity, threads, others + more) <= share
     assert fair_share(capacity, threads + more, others) >= share * (1 - 1e-9)
+
+
+# --- a worker that nobody measures -----------------------------------------------------------------------------------
+
+
+def unmeasured(runnable: float | None, *, node: str = "edge1", state: WorkerState | None = None) -> Profile:
+    """Of a node whose worker somebody else has started; without a state nobody sees it."""
+    workers = () if state is None else (load_of(state=state),)
+    return profile_of(node, cpu_used_cores=4.0, workers=workers, runnable=runnable)
+
+
+def come(shares: Shares, *, others: float | None, runnable: float, state: WorkerState | None = None) -> None:
+    """It is elsewhere until 0 s, and from then on here."""
+    if others is not None:
+        shares.look_elsewhere("merge", unmeasured(others), -1.0)
+    for at in range(round(SHOWN_S + COUNTED_S) + 5):
+        shares.learn("merge", unmeasured(runnable, state=state), float(at))
+
+
+@pytest.mark.parametrize("state", [None, WorkerState.READY])
+def test_its_threads_are_those_that_came_with_it(state: WorkerState | None) -> None:
+    """Its surplus threads were taken for others', so it fled from itself, without end."""
+    shares = Shares()
+    come(shares, others=1.0, runnable=6.0, state=state)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (5.0, 1.0)
+    assert shares.beside_unmeasured("merge", unmeasured(9.0), 2.0) == (5.0, 4.0), "who comes later is somebody else"
+    assert shares.beside_unmeasured("merge", unmeasured(9.0), 7.0) == (7.0, 2.0)
+    assert shares.beside_unmeasured("merge", unmeasured(None), 2.0) is None
+    assert shares.beside_unmeasured("merge", unmeasured(6.0, node="edge2"), 2.0) == (2.0, 4.0), "it is not there"
+
+
+def test_until_they_show_others_are_no_more_than_before() -> None:
+    shares = Shares()
+    shares.look_elsewhere("merge", unmeasured(1.0), -1.0)
+    assert not shares.learn("merge", unmeasured(6.0), 0.0)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 1.0)
+    assert not shares.learn("merge", unmeasured(6.0), SHOWN_S - 0.1)
+    assert shares.learn("merge", unmeasured(6.0), SHOWN_S)
+    assert shares.learn("merge", unmeasured(4.0), SHOWN_S + 1.0)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (4.0, 2.0), "on the mean"
+    assert not shares.learn("merge", unmeasured(1.0), SHOWN_S + COUNTED_S)
+
+
+def test_of_a_machine_that_was_not_seen_before_all_but_the_need_is_others() -> None:
+    shares = Shares()
+    come(shares, others=None, runnable=6.0)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)
+
+
+def test_a_worker_that_starts_or_is_measured_has_not_come() -> None:
+    shares = Shares()
+    come(shares, others=1.0, runnable=6.0, state=WorkerState.STARTING)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)
+    shares.look_elsewhere("merge", unmeasured(1.0), 99.0)
+    for at in range(20):
+        shares.learn("merge", profile(runnable=6.0, got=2.0), 100.0 + at)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)
+
+
+def test_it_may_go_on_for_some_seconds_after_it_has_another_owner() -> None:
+    shares = Shares()
+    come(shares, others=1.0, runnable=6.0)
+    for at in (100.0, 100.0 + LEFT_S):
+        shares.look_elsewhere("merge", unmeasured(6.0), at)
+        assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (5.0, 1.0)
+    shares.look_elsewhere("merge", unmeasured(2.0), 100.1 + LEFT_S)
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)
+    for at in range(200, 220):
+        shares.learn("merge", unmeasured(6.0), float(at))
+    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (4.0, 2.0), "it has come again"
+
+
+@pytest.mark.parametrize("is_of_task", [True, False])
+def test_nothing_is_known_of_a_task_or_a_node_that_is_no_more(*, is_of_task: bool) -> None:
+    for has_come in (False, True):
+        shares = Shares()
+        shares.look_elsewhere("merge", unmeasured(1.0), -1.0)
+        if has_come:
+            come(shares, others=None, runnable=6.0)
+        if is_of_task:
+            shares.forget("merge")
+        else:
+            shares.keep({"edge2"})
+        come(shares, others=None, runnable=6.0)
+        assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)
