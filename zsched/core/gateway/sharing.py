@@ -142,6 +142,7 @@ class Shares:
         is_at_work = load is None or (load.state is WorkerState.READY and load.cpu_cores is None)
         if profile.runnable is None or not is_at_work:
             return False
+        self._left_at.pop(key, None)
         before = self._unmeasured.get(key)
         if before is None:
             before = _Unmeasured(self._without.get(key), now)

@@ -361,9 +361,13 @@ def test_it_may_go_on_for_some_seconds_after_it_has_another_owner() -> None:
     for at in (100.0, 100.0 + LEFT_S):
         shares.look_elsewhere("merge", unmeasured(6.0), at)
         assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (5.0, 1.0)
-    shares.look_elsewhere("merge", unmeasured(2.0), 100.1 + LEFT_S)
+    shares.learn("merge", unmeasured(6.0), 101.0 + LEFT_S)
+    for at in (200.0, 200.0 + LEFT_S):
+        shares.look_elsewhere("merge", unmeasured(6.0), at)
+        assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (5.0, 1.0), "it was back for a moment"
+    shares.look_elsewhere("merge", unmeasured(2.0), 200.1 + LEFT_S)
     assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)
-    for at in range(200, 220):
+    for at in range(300, 320):
         shares.learn("merge", unmeasured(6.0), float(at))
     assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (4.0, 2.0), "it has come again"
 
