@@ -127,6 +127,12 @@ class Point(Struct, frozen=True, kw_only=True):
     age_s: float | None = None
     wall_s: float | None = None
 
+    def told(self) -> str:
+        """Which judgements it means, in words."""
+        if self.epoch is not None:
+            return f"before epoch {self.epoch}"
+        return f"until {self.word}" if self.age_s is None else f"of {self.word} ago or before"
+
 
 def _point_of(word: str) -> Point:
     """What ``--at`` says: ``12``, ``10m``, ``2026-11-23T18:46:15Z``.
@@ -160,14 +166,7 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Json]:
     if entry is None:
         is_edge = answer["explanation"]["kind"] == "edge"
         edge = f"; {node} is an edge and decides nothing: ask on a robot" if is_edge else ""
-        when = (
-            f"before epoch {point.epoch}"
-            if point.epoch is not None
-            else f"of {point.word} ago or before"
-            if point.age_s is not None
-            else f"until {point.word}"
-        )
-        raise CliError(EXIT_FAILED, f"the log of {node} has no judgement of {task} {when}{edge}")
+        raise CliError(EXIT_FAILED, f"the log of {node} has no judgement of {task} {point.told()}{edge}")
     written: Json = entry["decision"]
     told = _sums(written)
     head = {"schema": SCHEMA, "node": node, "age_s": max(now - float(entry["at"]), 0.0)}

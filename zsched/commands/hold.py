@@ -22,6 +22,7 @@ from zsched.commands.orders import (
     begin,
     check_name,
     check_said,
+    refused,
     tell_results,
 )
 from zsched.commands.page import span
@@ -58,9 +59,11 @@ def hold(view: OrderView, order: HoldOrder, names: Sequence[str], *, is_all: boo
         check_name(status, "task", name, list(known))
     if order.node is not None:
         check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
+    # the daemon plans no pin, so a plan would say yes to what it refuses
     if order.node is not None and len(chosen) == 1 and order.node not in known[chosen[0]]["candidates"]:
         able = ", ".join(known[chosen[0]]["candidates"])
-        raise CliError(EXIT_FAILED, f"{chosen[0]}: invalid: {order.node!r} is no candidate; there are {able}")
+        detail = f"{order.node!r} is no candidate; there are {able}"
+        raise refused(chosen[0], {"outcome": "invalid", "detail": detail})
     if not chosen:
         return _list_holds(view, order.hold, list(known.values()))
     if view.revision is not None and len(chosen) > 1:

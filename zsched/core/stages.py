@@ -384,7 +384,7 @@ class Stages:
             self.rested.hear(spec.name, told, now, is_explained=owner in leaseless)
         unfit = self._with_rested(spec, leaseless, now) if needs_lease else {}
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
-        ready = [name for name, load in loads if load is not None and load.state is WorkerState.READY]
+        ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         left = frozenset(self.flags.drained)
         stays = None if owner in left or (told is not None and told.draining) else owner
         unseen = self.unseen.look(

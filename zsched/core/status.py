@@ -554,7 +554,7 @@ def _may_follow(node: Stages, task: TaskSpec, profile: Profile, server: NodeId |
 def _no_spare(node: Stages, task: TaskSpec, value: Allocation, owner: NodeId, now: float) -> Iterator[str]:
     """That nobody could take a task over now; nodes that are away, or closed by an operator, are no trouble.
 
-    What machines lack is told as it would be if the owner were gone: then the file's figure counts, and no margin.
+    A machine lacks what it would lack if the owner were gone: the file's figure of memory counts, and no margin.
     """
     is_missed, untold = False, list[str]()
     states = {**node.membership.states(), owner: PeerState.GONE}
@@ -564,15 +564,14 @@ def _no_spare(node: Stages, task: TaskSpec, value: Allocation, owner: NodeId, no
             continue
         load = profile.worker(task.name)
         is_told = load is not None and (load.state is WorkerState.FAILED or _is_in_the_way(task, load))
+        is_ready = not is_told and may_get(task, None if load is None else load.state)
         lack = refused.get(profile.node, "")
-        if not is_told and may_get(task, None if load is None else load.state):
-            if not is_of_machine(lack):
-                return
-            untold.append(f"{profile.node} {lack}" if lack.startswith("needs") else f"on {profile.node} {lack}")
-            is_missed = True
-            continue
+        if is_ready and not is_of_machine(lack):
+            return
         is_missed = True
-        if load is None:
+        if is_ready:
+            untold.append(f"{profile.node} {lack}" if lack.startswith("needs") else f"on {profile.node} {lack}")
+        elif load is None:
             untold.append(f"{profile.node} runs no worker for it")
         elif not is_told:  # why the others cannot stands in lines of their own
             untold.append(f"the worker on {profile.node} {told_of_worker(load.state, load.reason)}")

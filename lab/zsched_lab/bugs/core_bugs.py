@@ -1442,8 +1442,8 @@ VOTE_BUGS = (
     _bug(
         "a task that no other machine has room for has a spare",
         "zsched.core.status",
-        "if not is_of_machine(lack):",
-        "if True:",
+        "if is_ready and not is_of_machine(lack):",
+        "if is_ready:",
         ("tests/unit/core/test_status.py",),
     ),
     _bug(

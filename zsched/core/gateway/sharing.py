@@ -18,6 +18,7 @@ from collections.abc import Container
 from typing import Final, Self
 
 from zsched.core.gateway.company import SAME_RATIO, STARVED_CPU_RATIO, is_full, others_cores
+from zsched.core.gateway.demand import SETTLE_S
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.values.model import NodeId, TaskId
@@ -26,10 +27,8 @@ from zsched.core.values.struct import Struct, replace
 
 ENDED_S: Final = 60.0
 """Others that do not fill a machine any more for this time have ended."""
-SHOWN_S: Final = 4.0
-"""By this time a machine's threads show a task that has come; the same as `zsched.core.gateway.demand.SETTLE_S`."""
 COUNTED_S: Final = 8.0
-"""For so long they are counted; what comes later is others'."""
+"""The threads that came with a task are counted for so long, once they show (`SETTLE_S`); later ones are others'."""
 LEFT_S: Final = 4.0
 """Others show what they do without the task for this time after its worker has stopped working there."""
 
@@ -92,13 +91,16 @@ class _Unmeasured(Struct, frozen=True):
     own: float | None = None
     """How many more there are since, on the mean of the first seconds in which they show; ``None``: not known."""
     looks: int = 0
+    left_at: float | None = None
+    """When the task was first seen to have another owner; ``None``: it has this one."""
 
     def look(self, runnable: float, now: float) -> Self:
         """With one more figure of the machine."""
-        if self.others is None or not SHOWN_S <= now - self.since < SHOWN_S + COUNTED_S:
-            return self
+        found = self if self.left_at is None else replace(self, left_at=None)
+        if self.others is None or not SETTLE_S <= now - self.since < SETTLE_S + COUNTED_S:
+            return found
         more, looks = max(runnable - self.others, 0.0), self.looks + 1
-        return replace(self, own=((self.own or 0.0) * self.looks + more) / looks, looks=looks)
+        return replace(found, own=((self.own or 0.0) * self.looks + more) / looks, looks=looks)
 
 
 class Shares:
@@ -111,8 +113,6 @@ class Shares:
         self._without: dict[tuple[TaskId, NodeId], float] = {}
         """Threads that run or wait on machines where a task is not that nobody measures."""
         self._unmeasured: dict[tuple[TaskId, NodeId], _Unmeasured] = {}
-        self._left_at: dict[tuple[TaskId, NodeId], float] = {}
-        """When such a task was first seen to have another owner."""
         self._got: dict[tuple[TaskId, NodeId], _Got] = {}
 
     def learn(self, task: TaskId, profile: Profile, now: float) -> bool:
@@ -142,7 +142,6 @@ class Shares:
         is_at_work = load is None or (load.state is WorkerState.READY and load.cpu_cores is None)
         if profile.runnable is None or not is_at_work:
             return False
-        self._left_at.pop(key, None)
         before = self._unmeasured.get(key)
         if before is None:
             before = _Unmeasured(self._without.get(key), now)
@@ -153,12 +152,10 @@ class Shares:
         """Note how many threads want to run where the task is not; for some seconds it may still be there, unseen."""
         key = (task, profile.node)
         known = self._unmeasured.get(key)
-        if known is not None:
-            left_at = self._left_at.setdefault(key, now)
-            if now - left_at <= LEFT_S:
-                return
-            del self._unmeasured[key]
-        self._left_at.pop(key, None)
+        if known is not None and (known.left_at is None or now - known.left_at <= LEFT_S):
+            self._unmeasured[key] = replace(known, left_at=now) if known.left_at is None else known
+            return
+        self._unmeasured.pop(key, None)
         if profile.runnable is not None:
             self._without[key] = profile.runnable
 
@@ -231,7 +228,6 @@ class Shares:
         """Know nothing of other nodes: one of the same name that comes later is another one."""
         self._without = {key: seen for key, seen in self._without.items() if key[1] in nodes}
         self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[1] in nodes}
-        self._left_at = {key: at for key, at in self._left_at.items() if key[1] in nodes}
         self._got = {key: got for key, got in self._got.items() if key[1] in nodes}
         self._others = {key: others for key, others in self._others.items() if key[1] in nodes}
 
@@ -240,7 +236,6 @@ class Shares:
         self._threads.pop(task, None)
         self._without = {key: seen for key, seen in self._without.items() if key[0] != task}
         self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[0] != task}
-        self._left_at = {key: at for key, at in self._left_at.items() if key[0] != task}
         self._got = {key: got for key, got in self._got.items() if key[0] != task}
         self._others = {key: others for key, others in self._others.items() if key[0] != task}
 

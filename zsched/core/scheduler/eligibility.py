@@ -113,11 +113,15 @@ def is_far_beyond(spec: TaskSpec, gauges: Mapping[GaugeName, float]) -> bool:
 
     Whatever is nearer to the limit than that would soon be left for it again.
     """
-    return any(
-        BY_NAME[name].is_far_beyond(gauges.get(name), limit)
-        for name, limit in spec.gauge_limits
-        if name != "gpu" or spec.demand.gpu
-    )
+    return any(BY_NAME[name].is_far_beyond(gauges.get(name), limit) for name, limit in _owner_limits(spec).items())
+
+
+def _owner_limits(spec: TaskSpec) -> dict[GaugeName, float]:
+    """An owner whose GPU may be busy with the task alone, for all that is known, is not left for that."""
+    limits = dict(spec.gauge_limits)
+    if "gpu" in limits and not spec.demand.gpu:
+        limits["gpu"] = BY_NAME["gpu"].high
+    return limits
 
 
 def is_of_machine(reason: str) -> bool:
@@ -134,14 +138,11 @@ def _beyond_limits(
 ) -> str:
     """Why the machine's gauges forbid the task; empty: they do not.
 
-    An owner whose GPU may be busy with the task alone, for all that is known, is not left for that. A task that nobody
-    keeps goes to a machine inside the margin, too: there is no other one that it could move back to.
+    A task that nobody keeps goes to a machine inside the margin, too: there is no other one that it could move back to.
     """
     told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
     added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
-    limits = dict(spec.gauge_limits)
-    if is_owner and "gpu" in limits and not spec.demand.gpu:
-        limits["gpu"] = BY_NAME["gpu"].high
+    limits = _owner_limits(spec) if is_owner else dict(spec.gauge_limits)
     faults = (
         BY_NAME[name].fault(
             gauges.get(name),
