@@ -32,7 +32,6 @@ from zsched.commands.orders import asker
 from zsched.commands.page import cut
 from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
 from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors, warnings_in_force
-from zsched.config.handing import mark_of, marks_of
 from zsched.config.load import check_bytes
 from zsched.config.parts import Part
 from zsched.config.reader import MAX_FILE_BYTES, render_all
@@ -48,9 +47,7 @@ OTHER_FILES = "other-files"
 """The danger of a first document: nodes that go by another file now."""
 OPEN_NETWORK = "open-network"
 """The danger of a node that strangers may reach, in a fleet without certificates."""
-BETWEEN_CELLS = "between-cells"
-"""The danger of a task that is on its way to another cell, which the document forgets, or starts here again."""
-DANGERS = (*(danger.value for danger in Danger), OTHER_FILES, OPEN_NETWORK, BETWEEN_CELLS)
+DANGERS = (*(danger.value for danger in Danger), OTHER_FILES, OPEN_NETWORK)
 PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
 
@@ -226,7 +223,6 @@ def make_plan(
         rollouts = (*rollouts, *begun(wave, pause_after, rollouts, by=asker(door), reason=view.reason))
     changes = tuple(told_in(one, rollouts) for one in changes)
     dangers = [(one.danger.value, one.warning()) for one in changes if one.danger is not None]
-    dangers += _between_cells(old, fleet, (held.text, text))
     note = "" if changes or text == held.text else "only comments, blanks or the order of keys differ: nothing notices"
     return Plan(
         held=held,
@@ -240,20 +236,6 @@ def make_plan(
         note=note,
         rollouts=tuple(sorted(rollouts, key=lambda one: str(one["task"]))),
     )
-
-
-def _between_cells(old: Fleet, new: Fleet, texts: tuple[str, str]) -> list[tuple[str, str]]:
-    """(the danger, what is accepted with it) of each task that is on its way and would be forgotten, or begun here."""
-    had, has = ({task.name for task in fleet.tasks} for fleet in (old, new))
-    found = []
-    for mark in marks_of(texts[0]):
-        is_begun = mark.task in has - had
-        if is_begun or mark_of(texts[1], mark.task) != mark:
-            then = "it begins here, too" if is_begun else "nothing tells any more how it goes on"
-            advice = f"`zsched task hand {mark.task} {mark.cell}` ends that, and with {old.name} takes it back"
-            text = f"{mark.task} is on its way to {mark.cell}, and may work there: {then}; {advice}"
-            found.append((BETWEEN_CELLS, text))
-    return found
 
 
 def _restarts(old: Fleet, new: Fleet) -> tuple[tuple[str, str], ...]:

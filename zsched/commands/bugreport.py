@@ -21,9 +21,8 @@ from zsched.clock import wall_ns
 from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.doctor import as_json, as_text
 from zsched.commands.page import size
-from zsched.commands.redaction import GONE, clean, clean_json, clean_yaml, secrets_of
+from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
 from zsched.commands.versions import versions
-from zsched.config.handing import marked, marks_of
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.core.values.struct import Struct, replace
 from zsched.doctor.look import Machine, look
@@ -76,11 +75,11 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
     yield _json("versions.json", {**versions(), **machine})
     try:
         text = read_regular(scene.file, MAX_FILE_BYTES).decode("utf-8", errors="replace")
-        yield Member(name="fleet.yaml", content=_document(text, secrets))
+        yield Member(name="fleet.yaml", content=clean_yaml(text, secrets).encode())
     except OSError as error:
         yield Member(name="fleet.yaml", missing=f"{scene.file}: {error.strerror}")
     if scene.text:
-        yield Member(name="document.yaml", content=_document(scene.text, secrets))
+        yield Member(name="document.yaml", content=clean_yaml(scene.text, secrets).encode())
     results = [(check, _cleaned(result, secrets)) for check, result in run_all(scene)]  # before lines are broken
     yield Member(name="doctor.txt", content=as_text(results, TEXT_WIDTH, is_colored=False).encode())
     yield _json("doctor.json", as_json(scene, results))
@@ -96,13 +95,6 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
         yield Member(name="journal.txt", content=clean((journal or _journal)(), secrets).encode())
     except OSError as error:
         yield Member(name="journal.txt", missing=str(error.strerror or error))
-
-
-def _document(text: str, secrets: tuple[str, ...]) -> bytes:
-    """A fleet file; no fleet that is known here tells the secrets of a task that a comment keeps for another cell."""
-    for mark in marks_of(text):
-        text = marked(text, replace(mark, entry=GONE))
-    return clean_yaml(text, secrets).encode()
 
 
 def _decision_logs(folder: Path, secrets: tuple[str, ...]) -> Iterator[Member]:

@@ -132,17 +132,6 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     return _watch(watching, nodes, revision, order.deadline_s)
 
 
-def check_drain(view: OrderView, order: DrainOrder) -> None:
-    """Refuse what `drain` would refuse, before anything is done.
-
-    Raises:
-        CliError: as of `drain`.
-    """
-    status, held = _status(view.door), _held(view)
-    after = _with(view, held, order.kind, _chosen(status, order))
-    _check_dangers(view, order.accepted, status, held.flags, after)
-
-
 def undrain(view: OrderView, nodes: Sequence[str]) -> int:
     """End the drain of nodes; returns the exit code.
 

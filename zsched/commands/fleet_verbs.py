@@ -196,52 +196,6 @@ def task_promote(
     raise typer.Exit(promote(find_door(runtime_dir, node, connect=connect), view, tasks or []))
 
 
-@task_app.command("hand", cls=Verb)
-def task_hand(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet.")],
-    cell: Annotated[
-        str, typer.Argument(metavar="CELL", help="Another fleet of the site; this one: take it back from its way.")
-    ],
-    entry: Annotated[
-        str | None,
-        typer.Option("--entry", metavar="FILE", help="Its entry as it shall be there, with the one key `tasks`."),
-    ] = None,
-    deadline: Annotated[
-        str, typer.Option("--deadline", metavar="DURATION", help="How long it may take to be ready there: 90s, 10m.")
-    ] = "2m",
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    reason: ReasonOption = "",
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
-    """Hand a task over to another fleet of the site: it works on here until it is ready there.
-
-    An exclusive task stops here first. Where the other fleet does not get it ready in time, it is taken back (exit code
-    1). The same command goes on behind Ctrl-C; with this fleet's own name it takes the task back.
-    """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.hand import hand  # noqa: PLC0415 - as above
-    from zsched.commands.hand_steps import HandOrder  # noqa: PLC0415 - as above
-    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
-
-    order = HandOrder(
-        task=task,
-        cell=cell,
-        door=find_door(runtime_dir, node, connect=connect),
-        where=where_of((node, runtime_dir, connect)),
-        entry=entry,
-        deadline_s=duration_s(deadline),
-        reason=reason,
-        is_plan=plan,
-        is_yes=yes,
-        is_json=json_,
-    )
-    raise typer.Exit(hand(order))
-
-
 @node_app.command("add", cls=Verb)
 def node_add(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="YAML with the one key `nodes`, as in a fleet file.")],

@@ -87,19 +87,13 @@ class LeaveOrder(Struct, frozen=True, kw_only=True):
     is_plan: bool = False
     is_yes: bool = False
     is_json: bool = False
-    to: str = ""
-    """The cell that it leaves for, or an invitation's file; empty: it leaves for none."""
     options: tuple[str, ...] = ()
     """Those that were given and that the command needs again."""
 
     @property
     def verb(self) -> str:
         """The command as it is to be given again."""
-        return self.leaving_for(self.to)
-
-    def leaving_for(self, cell: str) -> str:
-        """The command to another cell, or (empty) to none."""
-        return shlex.join(("zsched", "leave", *(("--to", cell) if cell else ()), *self.options))
+        return shlex.join(("zsched", "leave", *self.options))
 
 
 class Way(Struct, frozen=True, kw_only=True):

@@ -220,10 +220,6 @@ def join(
 
 
 def leave(
-    to: Annotated[
-        str | None,
-        typer.Option("--to", metavar="CELL", help="Join this cell of the site; or the file of an invitation into one."),
-    ] = None,
     purge: Annotated[
         bool,
         typer.Option("--purge", help="Delete this machine's files of the fleet, its key too; else they are renamed."),
@@ -245,17 +241,11 @@ def leave(
     Nothing of the others' streams is lost; in a secured fleet they pause while the daemons begin again. Exits with 5 at
     the deadline: the leave stays in force, and the same command goes on with it; `zsched undrain NODE` takes it back.
     Another machine is taken out by `zsched node forget`.
-
-    With --to the machine becomes a node of another fleet of the site, and is ready there in the end. Its own fleet
-    names it until then: where the other one does not take it, it goes back.
     """
     from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.leave import LeaveOrder  # noqa: PLC0415 - as above
     from zsched.commands.leave import leave as go  # noqa: PLC0415 - as above
-    from zsched.exits import EXIT_USAGE  # noqa: PLC0415 - as above
 
-    if to is not None and purge:
-        raise CliError(EXIT_USAGE, "--purge does not go with --to: until it is over, the files are the way back")
     options: list[tuple[str, object]] = [("--accept", name) for name in accept or ()]
     options += [
         ("-m", reason or None),
@@ -273,11 +263,6 @@ def leave(
         is_plan=plan,
         is_yes=yes,
         is_json=json_,
-        to=to or "",
         options=(*(["--purge"] if purge else []), *_given(options)),
     )
-    if to is not None:
-        from zsched.commands.change_cell import change_cells  # noqa: PLC0415 - as above
-
-        raise typer.Exit(change_cells(order, to))
     raise typer.Exit(go(order))

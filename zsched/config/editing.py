@@ -87,57 +87,6 @@ def add_entries(text: str, section: str, fragment: str, file: str = "the file") 
     return _checked(_added(text, section, fragment, added), wanted, f"{', '.join(names)} cannot be added")
 
 
-def node_entry(text: str, name: str, protocol: str) -> str:
-    """The node ``name`` of the fleet file ``text`` as it would stand in another fleet's file, with the key ``nodes``.
-
-    Its links to nodes of its fleet stay behind, and it listens with ``protocol``.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    entry = _at(_tree(text), ("nodes", name))
-    if not isinstance(entry, Mapping):
-        raise ConfigError(f"the fleet's file has no nodes.{name}")
-    pairs = [(key, _spoken(held, protocol) if key.text == "listen" else held) for key, held in entry.pairs]
-    kept = replace(entry, pairs=tuple((key, held) for key, held in pairs if key.text != "links"))
-    return f"nodes:\n  {name}: {flow(kept)}\n"
-
-
-def task_entry(text: str, name: str) -> str:
-    """The task ``name`` of the fleet file ``text`` as `add_entries` takes it: its own lines, with its comments.
-
-    Where they say something else alone, as with an anchor, the entry is written anew on one line.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    held = _at(_tree(text), ("tasks", name))
-    if held is None:
-        raise ConfigError(f"the fleet's file has no tasks.{name}")
-    found = _find(text, ("tasks",))
-    assert found is not None
-    entry = next(one for one in found.entries if one.name == name)
-    anew = f"tasks:\n{' ' * _STEP}{name}: {flow(held)}\n"
-    if found.is_flow:
-        return anew
-    lines = text[_line_start(text, entry.start) : _last_line_end(text, entry)].splitlines()
-    kept = "tasks:\n" + "".join(f"{_shifted(line, entry.col, _STEP)}\n" for line in lines)
-    root, _ = read_yaml(kept.encode())
-    alone = None if root is None else _at(root, ("tasks", name))
-    return kept if alone is not None and flow(alone) == flow(held) else anew
-
-
-def _spoken(listen: Node, protocol: str) -> Node:
-    """The endpoints of a node with another protocol."""
-    if not isinstance(listen, Mapping):
-        return listen
-    pairs = [
-        (key, replace(held, text=f"{protocol}/{held.text.partition('/')[2]}") if isinstance(held, Scalar) else held)
-        for key, held in listen.pairs
-    ]
-    return replace(listen, pairs=tuple(pairs))
-
-
 def remove_task(text: str, name: str) -> str:
     """The fleet file ``text`` without the task ``name``.
 

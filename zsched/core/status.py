@@ -47,7 +47,6 @@ from zsched.core.values.words import (
     RESTARTING,
     TAKEN_OUT,
     WAS_READY,
-    told_of_hand,
     told_of_worker,
 )
 from zsched.core.vote.generations import way_out
@@ -195,7 +194,6 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
         problems.append(_nothing_agreed(node, quorum, fresh))
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
-    problems += [told_of_hand(task, cell, node.fleet.name) for task, cell in node.fleet.handed]
     return tuple(problems)
 
 

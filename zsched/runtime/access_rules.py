@@ -20,7 +20,7 @@ from zsched.core.values.certificates import Role, accepted
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, StreamRule, TaskSpec, runs_worker
 from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import Direction, RosGraph
-from zsched.wire.keyspace import GIVEN_CHUNK, ROOT, Keyspace
+from zsched.wire.keyspace import ROOT, Keyspace
 
 Json = dict[str, Any]
 
@@ -100,13 +100,13 @@ def _holders(fleet: Fleet, security: Security, side: Side) -> Iterator[tuple[str
         return [one.common_name(fleet.name) for one in accepted(name, role, security.revoked)]
 
     for node in fleet.nodes:
-        yield f"node {node.name}", names(node.name, Role.NODE), list(_node_rules(fleet, security, node, side))
+        yield f"node {node.name}", names(node.name, Role.NODE), list(_node_rules(fleet, node, side))
     for role, people in ((Role.OPERATOR, security.operators), (Role.GUEST, security.guests)):
         for name in people if side is not Side.VISIT else ():
             yield f"{role} {name}", names(name, role), list(_visitor_rules(fleet, name, role, side))
 
 
-def _node_rules(fleet: Fleet, security: Security, node: NodeSpec, side: Side) -> Iterator[Rule]:
+def _node_rules(fleet: Fleet, node: NodeSpec, side: Side) -> Iterator[Rule]:
     keys, everything = Keyspace(fleet.name), _everything(fleet)
     if side is Side.VISIT:
         yield "ingress", ALL, everything
@@ -120,10 +120,8 @@ def _node_rules(fleet: Fleet, security: Security, node: NodeSpec, side: Side) ->
         yield "ingress", (TOKEN,), [keys.alive(node.name, "*")]
     else:
         speaks, asks = _stream_keys(fleet, node)
-        given = [_given(name) for name in security.guests]  # a node passes on what a guest gives to its worker
-        asked = [*_with_suffixes(asks), keys.role("*", "*"), keys.snapshot("*", "*"), *given]
-        taken = [_given("*", node.name)] if given else []
-        yield "ingress", SPEAK, [own, *_with_suffixes(speaks), *_graph(fleet), *taken]
+        asked = [*_with_suffixes(asks), keys.role("*", "*"), keys.snapshot("*", "*")]
+        yield "ingress", SPEAK, [own, *_with_suffixes(speaks), *_graph(fleet)]
     yield "ingress", ASK, asked
     yield "ingress", LISTEN, everything
     yield "egress", ALL, everything
@@ -142,14 +140,6 @@ def _visitor_rules(fleet: Fleet, name: str, role: Role, side: Side) -> Iterator[
     yield "egress", GET, [*readable, *GRAPH]
     yield "ingress", ASK, [keys.role("*", "*")]  # `zsched ping`
     yield "egress", ("reply",), [keys.role("*", "*")]
-    if role is Role.GUEST:  # another cell gives its streams in its own name; a taker takes from those that it names
-        yield "ingress", ASK, [_given(name)]
-        yield "egress", ("reply",), [_given(name)]
-
-
-def _given(cell: str, node: str = "*") -> str:
-    """The keys under which the takers of a node are given the streams of a cell."""
-    return f"{node}/*/{GIVEN_CHUNK}/{cell}/{ANYTHING}"
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from zsched.adapters.host.document_store import DocumentStore
-from zsched.config.handing import marks_of
 from zsched.config.load import check_bytes, check_file
 from zsched.config.reader import render_all
 from zsched.core import events as ev
@@ -177,8 +176,7 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if result.fleet.security is None and _secures(config, fleet):
         advice = "put it into the document, or, to end it, first delete it from the fleet file of every machine"
         raise ConfigError(f"the document has no section `security:`, and {config} has one: {advice}")
-    handed = tuple((mark.task, mark.cell) for mark in marks_of(content.text))
-    return replace(with_rollouts(result.fleet, content.rollouts), handed=handed)
+    return with_rollouts(result.fleet, content.rollouts)
 
 
 def _secures(config: Path, fleet: str) -> bool:

@@ -61,8 +61,6 @@ COPY_NAME: Final = "copied"
 """In the state folder: the hash of the fleet file that was written as a copy of the document."""
 OUT_NAME: Final = "out"
 """In the state folder, from before the daemon ends for good until its files are put away: see `note_out`."""
-NEXT_CELL: Final = "next-cell"
-"""In the state folder, while the machine changes cells: private keys are in it, and only its owner may read it."""
 LOGS: Final = decision_log.NAMES
 """They go with the fleet of which they tell: tasks and epochs of the next one may have the same names and numbers."""
 PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
@@ -655,12 +653,8 @@ def is_out(fleet: str, node: NodeId, state: Path) -> bool:
     return content is None
 
 
-def put_away(
-    fleet: str, node: NodeId, places: Places, *, is_purged: bool, comes_back: bool = False
-) -> tuple[Written, ...]:
+def put_away(fleet: str, node: NodeId, places: Places, *, is_purged: bool) -> tuple[Written, ...]:
     """Rename this machine's files of its fleet, or delete them; then it can found or join one. Its daemon has ended.
-
-    ``comes_back``: they may be wanted again (`bring_back`), so nothing is deleted.
 
     Raises:
         AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed or deleted.
@@ -669,66 +663,11 @@ def put_away(
         file.check_owner()
         there = tuple(_belongings(places, is_purged=is_purged))
         for one in there:
-            _put_one_away(one.path, is_deleted=is_purged or (one.path.name == COPY_NAME and not comes_back))
+            _put_one_away(one.path, is_deleted=is_purged or one.path.name == COPY_NAME)
         with contextlib.suppress(OSError):
             (places.state / OUT_NAME).unlink(missing_ok=True)
             mark_of(places.config).unlink(missing_ok=True)  # of a creation that was finished but for this
     return tuple(Written(path=one.path, what=_fate(one, is_purged=is_purged)) for one in there)
-
-
-def bring_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) -> None:
-    """Delete this machine's files of ``fleet``, and give those that were put away for it their names again.
-
-    Its daemon has ended. The state goes first and comes last, so that a machine is never two nodes.
-    ``is_secured``: there were certificates among them.
-
-    Raises:
-        AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed or deleted.
-    """
-    with StateFile(places.state, fleet=fleet, node=node) as file:
-        file.check_owner()
-        for one in reversed(tuple(_belongings(places, is_purged=False))):
-            if one.path.name not in LOGS:  # the former one's take their places
-                _put_one_away(one.path, is_deleted=True)
-        for path in (*_come_back(places, is_secured=is_secured), places.state / STATE_NAME):
-            _name_again(path)
-
-
-def finish_back(fleet: str, node: NodeId, places: Places, *, is_secured: bool) -> None:
-    """Give the files their names again that are still put away: `put_away` or `bring_back` was broken off.
-
-    Raises:
-        AdapterError: a daemon runs by them, they are another node's, or one cannot be renamed.
-    """
-    all_of_it = (*_come_back(places, is_secured=is_secured), places.state / STATE_NAME)
-    gone = [path for path in all_of_it if not os.path.lexists(path)]
-    if any(os.path.lexists(_left_name(path)) for path in gone):
-        with StateFile(places.state, fleet=fleet, node=node) as file:
-            file.check_owner()
-            for path in gone:
-                _name_again(path)
-
-
-def _come_back(places: Places, *, is_secured: bool) -> list[Path]:
-    """What was renamed for a cell change, but the state."""
-    names = [places.config, *(places.state / name for name in (*LOGS, COPY_NAME, FOLDER_NAME))]
-    folders = (places.config.parent / PKI_FOLDER, places.state / PKI_FOLDER)
-    own = [folder for folder in folders if is_secured and not _is_planted(folder, places)]
-    return [*names, *(folder / name for folder in own for name in _WHAT)]
-
-
-def _left_name(path: Path) -> Path:
-    return path.with_name(f"{path.name}{LEFT}")
-
-
-def _name_again(path: Path) -> None:
-    old = _left_name(path)
-    try:
-        if os.path.lexists(old):
-            old.rename(path)
-            sync_folder(path.parent)
-    except OSError as error:
-        raise AdapterError(f"cannot rename {old}: {error.strerror}; {_advice(error, old)}") from error
 
 
 def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
@@ -741,7 +680,7 @@ def _belongings(places: Places, *, is_purged: bool) -> Iterator[Written]:
             continue
         for name, what in _WHAT.items():
             yield from _there(folder / name, what, is_purged=is_purged)
-    more = (rehearsals.FOLDER_NAME, core_speed.NAME, NEXT_CELL, LIFE_NAME) if is_purged else ()
+    more = (rehearsals.FOLDER_NAME, core_speed.NAME, LIFE_NAME) if is_purged else ()
     for name in (*more, *LOGS, COPY_NAME, FOLDER_NAME):
         yield from _there(places.state / name, _KEPT.get(name, "the node's records"), is_purged=is_purged)
     yield from _there(places.config, "the fleet file", is_purged=is_purged)

@@ -24,8 +24,6 @@ END_CHUNK = "@zsched/end"
 """Suffix of the in-band end markers behind a stream's last sample, and the start markers: ``{to}/@zsched/end``."""
 AGAIN_CHUNK = "@zsched/again"
 """Behind an output's key, with a relay's zenoh id behind it: what that relay has missed, sent once more."""
-GIVEN_CHUNK = "@zsched/given"
-"""Behind ``<node>/<task>`` of a taker, with the giver's cell and the stream's key behind it: a sample that crosses."""
 
 
 class ParsedKey(Struct, frozen=True, kw_only=True):

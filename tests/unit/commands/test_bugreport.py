@@ -16,7 +16,6 @@ from support.schemas import faults
 from zsched.adapters.host.decision_log import NAME, OLD_NAME
 from zsched.cli import app
 from zsched.commands.bugreport import gathered
-from zsched.config.handing import Mark, marked
 
 SECRET = "swordfish"
 TEXT = FLEET.replace("worker: {", f"worker: {{env: {{API_TOKEN: {SECRET}}}, ")
@@ -29,17 +28,6 @@ def test_a_secret_of_several_words_does_not_pass_where_lines_are_broken(tmp_path
     members = {one.name: one.content.decode() for one in gathered(scene, lambda: "")}
     for word in secret.split():
         assert word not in members["doctor.txt"], word
-
-
-@pytest.mark.parametrize("name", ["fleet.yaml", "document.yaml"])
-def test_the_secret_of_a_task_on_its_way_to_another_cell_is_not_in_it(tmp_path: Path, name: str) -> None:
-    """Its entry is a comment, and it is a task of no fleet that is known here."""
-    entry = f"tasks:\n  count: {{worker: {{command: [count, --token, {SECRET}]}}}}\n"
-    text = marked(FLEET, Mark(task="count", cell="hall-b", entry=entry))
-    scene = replace(fleet_scene(tmp_path, text), text=text)
-    told = {one.name: one.content.decode() for one in gathered(scene, lambda: "")}[name]
-    assert SECRET not in told
-    assert "# zsched: task count goes to cell hall-b" in told
 
 
 def no_journal() -> str:

@@ -32,7 +32,6 @@ CHANGING = {
         "task add",
         "task remove",
         "task promote",
-        "task hand",
         "node add",
         "node remove",
         "node forget",

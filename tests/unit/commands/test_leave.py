@@ -412,8 +412,6 @@ def test_purged_nothing_is_left(hall: Hall) -> None:
     (hall.folder / "fleet.yaml.left").write_text("an older fleet\n")
     (hall.folder / "pki").mkdir()
     (hall.folder / "pki" / "key.pem").write_text("secret")
-    (hall.folder / "state" / "next-cell").mkdir()
-    (hall.folder / "state" / "next-cell" / "invitation").write_text("holds a key, too")
     (hall.folder / "pki" / "operator.pem").write_text("ours")
     plan = run("--purge", "--plan")
     assert "key.pem: the private key, for its owner only, deleted" in plan.stdout

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.config.editing import add_entries, add_names, is_list, node_entry, remove_node, remove_task
+from zsched.config.editing import add_entries, add_names, is_list, remove_node, remove_task
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet
 from zsched.errors import ConfigError
@@ -212,25 +212,3 @@ def test_names_are_added_to_the_candidates_of_a_task_only_where_they_are_a_list(
         add_names(text, ("tasks", "count", "candidates"), ["x"])
     with pytest.raises(ConfigError, match="cannot be added"):
         add_names("{fleet: f}", ("seeds",), ["x"])
-
-
-def test_a_node_goes_to_another_fleet_with_its_entry_but_its_links_and_with_that_fleet_s_protocol() -> None:
-    text = (
-        "fleet: hall-a\n"
-        "nodes:\n"
-        "  robot1: {kind: robot}\n"
-        "  robot2:  # the tall one\n"
-        "    kind: robot\n"
-        '    listen: {control: "tcp/192.0.2.1:7457", data: "tcp/192.0.2.1:7458"}\n'
-        '    local: {mode: peer, listen: ["tcp/127.0.0.1:7460"]}\n'
-        "    links: {robot1: {fixed: -50}}\n"
-        "tasks: {}\n"
-    )
-    entry = node_entry(text, "robot2", "tls")
-    listen = '{control: "tls/192.0.2.1:7457", data: "tls/192.0.2.1:7458"}'
-    local = '{mode: peer, listen: ["tcp/127.0.0.1:7460"]}'
-    assert entry == f"nodes:\n  robot2: {{kind: robot, listen: {listen}, local: {local}}}\n"
-    there = "fleet: hall-b\nnodes:\n  edge1: {kind: edge}\ntasks: {}\n"
-    assert "robot2: {kind: robot, listen: {" in add_entries(there, "nodes", entry)
-    with pytest.raises(ConfigError, match=r"no nodes\.robot9"):
-        node_entry(text, "robot9", "tcp")

@@ -213,28 +213,3 @@ def test_guests_and_operators_read_streams_and_put_nothing() -> None:
 def test_a_visitor_believes_members_only() -> None:
     assert may(Side.VISIT, "edge1", "ingress", "reply", KEYS.status("robot1", "ana"))
     assert not may(Side.VISIT, "screen.guest", "ingress", "reply", KEYS.status("robot1", "ana"))
-
-
-GIVEN = "edge1/take/@zsched/given/screen/robot1/map"
-
-
-def test_a_guest_gives_streams_in_its_own_name_only() -> None:
-    assert may(Side.DATA, "screen.guest", "ingress", "query", GIVEN)
-    assert may(Side.DATA, "screen.guest", "egress", "reply", GIVEN)
-    assert not may(Side.DATA, "screen.guest", "ingress", "query", GIVEN.replace("screen", "other"))
-    assert not may(Side.DATA, "screen.guest", "ingress", "put", GIVEN)
-    assert not may(Side.DATA, "ana.operator", "ingress", "query", GIVEN)
-
-
-def test_a_node_takes_for_itself_and_passes_on_what_guests_give() -> None:
-    taken = "edge1/take/@zsched/given/screen/**"
-    assert may(Side.DATA, "edge1", "ingress", "declare_queryable", taken)
-    assert not may(Side.DATA, "edge2", "ingress", "declare_queryable", taken)
-    assert may(Side.DATA, "edge2", "ingress", "query", GIVEN)
-    assert not may(Side.DATA, "edge2", "ingress", "query", GIVEN.replace("screen", "other"))
-
-
-def test_where_there_is_no_guest_nobody_takes() -> None:
-    alone = TEXT.replace("guests: [screen], ", "")
-    assert not may(Side.DATA, "edge1", "ingress", "declare_queryable", "edge1/take/@zsched/given/screen/**", alone)
-    assert not may(Side.DATA, "edge2", "ingress", "query", GIVEN, alone)

@@ -9,11 +9,9 @@ from pathlib import Path
 import pytest
 
 from zsched.adapters.host.document_store import DocumentStore
-from zsched.config.handing import Mark, marked
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.document import Document, Flag, FlagKind, Text
-from zsched.core.values.fleet import fleet_hash
 from zsched.core.values.model import NodeId
 from zsched.errors import ConfigError
 from zsched.runtime.library import RECENT, Library
@@ -73,14 +71,6 @@ def test_an_operator_s_document_is_on_disk_before_the_node_hears_of_it(desk: Des
     assert (event.document, event.request) == (document_hash(document()), 7)
     assert desk.store.load(event.document) == document()
     assert event.fleet.zenoh_config == str(tmp_path / "config" / "keys" / "zenoh.json5")
-
-
-def test_a_document_says_which_tasks_are_on_their_way_to_another_cell(desk: Desk) -> None:
-    told = marked(FILE, Mark(task="count", cell="hall-b", entry="tasks:\n  count: {}\n"))
-    fleet, before = (desk.library.read(document(text=text)) for text in (told, FILE))
-    assert (fleet.handed, before.handed) == ((("count", "hall-b"),), ())
-    assert fleet == before, "it orders nothing"
-    assert fleet_hash(fleet) == fleet_hash(before), "as a node says that knows of no such comment"
 
 
 def test_a_document_comes_from_the_first_peer_that_has_it(desk: Desk) -> None:

@@ -8,28 +8,23 @@ import stat
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
-from support.authorities import install, make_authority
 from zsched.adapters.host import state_file
 from zsched.adapters.host.document_store import DocumentStore
-from zsched.adapters.host.state_file import StateFile, replace_synced
+from zsched.adapters.host.state_file import StateFile
 from zsched.config.load import load_fleet
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.errors import AdapterError, ConfigError
-from zsched.pki.authority import opened
-from zsched.runtime import membership, next_cell, unfinished
+from zsched.runtime import membership, unfinished
 from zsched.runtime.init import init_state
 from zsched.runtime.membership import (
     BEFORE,
-    NEXT_CELL,
     Places,
-    bring_back,
     copied_file,
     found,
     is_joined,
@@ -372,129 +367,6 @@ def test_a_link_in_the_state_folder_never_chooses_whose_keys_are_put_away(
     put_away("hall", "robot2", second, is_purged=True)
     assert [one.name for one in theirs.iterdir()] == ["key.pem"]
     assert not (second.state / "state").exists()
-
-
-def test_a_link_in_the_state_folder_never_chooses_whose_keys_come_back(
-    second: Places, invitation: Invitation, tmp_path: Path
-) -> None:
-    """As above, where a change of cells goes back: an old key would take the place of somebody's own."""
-    join(invitation, second, is_plan=False)
-    put_away("hall", "robot2", second, is_purged=False, comes_back=True)
-    join(invitation, second, is_plan=False)
-    theirs = tmp_path / "elsewhere"
-    theirs.mkdir()
-    (theirs / "key.pem").write_text("somebody's own")
-    (theirs / "key.pem.left").write_text("an old one")
-    (second.state / "pki").symlink_to(theirs)
-    bring_back("hall", "robot2", second, is_secured=True)
-    assert (theirs / "key.pem").read_text() == "somebody's own"
-    assert (second.state / "state").exists()
-
-
-def test_a_link_in_place_of_the_next_cell_s_folder_is_not_gone_by(
-    first: Places, invitation: Invitation, tmp_path: Path
-) -> None:
-    """As above: root would close somebody's folder to all others, and put keys there, or believe what lies there."""
-    fleet, theirs = load_fleet(first.config), tmp_path / "elsewhere"
-    theirs.mkdir(mode=0o755)
-    link = first.state / NEXT_CELL
-    link.symlink_to(theirs)
-    next_cell.begin(first.state, fleet, TEXT, invitation)
-    assert (stat.S_IMODE(theirs.stat().st_mode), list(theirs.iterdir())) == (0o755, [])
-    assert stat.S_IMODE(link.lstat().st_mode) == 0o700
-    assert next_cell.under_way(first.state) is not None
-    link.rename(theirs / "mine")
-    link.symlink_to(theirs / "mine")
-    with pytest.raises(AdapterError, match="is none that this command has made"):
-        next_cell.under_way(first.state)
-
-
-def test_a_former_cell_is_asked_by_the_certificate_that_was_sent_here(
-    first: Places, invitation: Invitation, tmp_path: Path
-) -> None:
-    """It lies in the state folder, which an option may have named."""
-    first.config.write_text(SECURED)
-    install(make_authority(tmp_path / "authority", "hall"), first.config.parent / "pki", "robot1")
-    with opened(tmp_path / "authority", "hall") as authority:
-        sent = authority.renew("robot1", None, b"", b"", datetime.now(UTC) + timedelta(days=20)).certificate
-    (first.state / "pki").mkdir()
-    (first.state / "pki" / "certificate.pem").write_bytes(sent)
-    change = next_cell.begin(first.state, load_fleet(first.config), SECURED, invitation)
-    assert (change.former_file.parent / "pki" / "certificate.pem").read_bytes() == sent
-
-
-def test_a_former_cell_whose_authority_is_another_one_since_is_asked_by_that(
-    first: Places, invitation: Invitation
-) -> None:
-    """A change that was broken off may wait for weeks: by the old certificate the former cell lets nobody in."""
-    first.config.write_text(SECURED)
-    fleet, pki = load_fleet(first.config), first.config.parent / "pki"
-    pki.mkdir()
-
-    def install(age: str) -> None:
-        for name in ("certificate.pem", "key.pem", "ca.pem"):
-            (pki / name).write_text(f"{age} {name}")
-
-    install("old")
-    change = next_cell.begin(first.state, fleet, SECURED, invitation)
-    install("new")
-    again = next_cell.refreshed(first.state, fleet, SECURED.replace("7457", "7557"), change)
-    assert again == next_cell.under_way(first.state) == change
-    assert "7557" in change.former_file.read_text()
-    held = change.former_file.parent / "pki"
-    assert {path.read_text() for path in held.iterdir()} == {f"new {path.name}" for path in pki.iterdir()}
-    assert {stat.S_IMODE(path.stat().st_mode) for path in held.iterdir()} == {0o600}
-
-
-@pytest.mark.parametrize("is_link", [True, False])
-@pytest.mark.parametrize("at", range(1, 4))
-def test_what_takes_the_place_of_the_next_cell_s_folder_while_it_is_written_gets_nothing(
-    first: Places, invitation: Invitation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, *, is_link: bool
-) -> None:
-    """The service may rename what lies in its own folder at any time: root's keys would go where it likes."""
-    folder, theirs = first.state / NEXT_CELL, tmp_path / "elsewhere"
-    for name in ("former", "next"):
-        (theirs / name / "pki").mkdir(parents=True)
-    count = 0
-
-    def replaced(path: Path, new: Path, content: bytes, mode: int = 0o600) -> None:
-        nonlocal count
-        count += 1
-        if count == at:
-            folder.rename(tmp_path / "away")
-            if is_link:
-                folder.symlink_to(theirs)
-            else:
-                theirs.rename(folder)
-        replace_synced(path, new, content, mode)
-
-    monkeypatch.setattr(next_cell, "replace_synced", replaced)
-    with pytest.raises(AdapterError, match="was moved away while it was written"):
-        next_cell.begin(first.state, load_fleet(first.config), TEXT, invitation)
-    assert count >= 3
-    assert [path for path in folder.rglob("*") if path.is_file()] == []
-    assert [path for path in theirs.rglob("*") if path.is_file()] == []
-
-
-def test_a_file_of_the_next_cell_that_cannot_be_written_is_named(
-    first: Places, invitation: Invitation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(_path: Path, new: Path, _content: bytes) -> None:
-        raise OSError(28, "No space left on device", str(new))
-
-    monkeypatch.setattr(next_cell, "replace_synced", refused)
-    with pytest.raises(AdapterError, match=f"^{first.state / NEXT_CELL}/former/fleet.yaml.new: No space left"):
-        next_cell.begin(first.state, load_fleet(first.config), TEXT, invitation)
-
-
-@pytest.mark.root
-def test_root_goes_by_no_change_of_cells_that_the_service_has_written(first: Places, invitation: Invitation) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("only root may read it at all")
-    next_cell.begin(first.state, load_fleet(first.config), TEXT, invitation)
-    os.chown(first.state / NEXT_CELL, 65_533, 65_533)
-    with pytest.raises(AdapterError, match="is none that this command has made"):
-        next_cell.under_way(first.state)
 
 
 def test_a_state_folder_in_use_is_refused_before_anything_is_written(second: Places, invitation: Invitation) -> None:

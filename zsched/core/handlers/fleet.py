@@ -48,7 +48,6 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     if _is_refused(node, fleet):
         return
     if fleet == before and not anew:
-        node.fleet = fleet  # what it says beside its entries may differ (`Fleet.handed`)
         return
     node.fleet, node.fleet_file, node.text_hash = fleet, fleet_hash(fleet), file_hash(fleet)
     _adopt_nodes(node, fleet)

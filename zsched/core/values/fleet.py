@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 from typing import Any
@@ -465,8 +465,6 @@ class Fleet:
         SharedMemory.OFF, "Large payloads within a machine; `auto`: where the node finds it fit."
     )
     """Fit is its /dev/shm (`zsched.adapters.machine.shared_memory`)."""
-    handed: tuple[tuple[TaskId, str], ...] = field(default=(), compare=False)
-    """(a task, the cell that it is on its way to), as the document says beside its entries: they order nothing."""
 
     @property
     def voters(self) -> tuple[NodeId, ...]:

@@ -68,17 +68,6 @@ def has_lost_its_worker(state: str, reason: str) -> bool:
     return state in ("failed", "stopped") or (state == "starting" and reason.startswith(WAS_READY))
 
 
-def told_of_hand(task: str, cell: str, fleet: str) -> str:
-    """That a task of ``fleet`` is on its way to another cell, and how that ends.
-
-    >>> told_of_hand("merge", "hall-b", "hall-a").partition(", ")[0]
-    'merge is on its way to hall-b'
-    """
-    verb = f"zsched task hand {task}"
-    told = f"{task} is on its way to {cell}, and stays so unless somebody's `zsched task hand` is at work"
-    return f"{told}; `{verb} {cell}` goes on, `{verb} {fleet}` takes it back"
-
-
 def check_range(field: str, value: float | None, low: float, high: float) -> None:
     """Raise `ValueError` unless ``low <= value <= high`` (``None``, "not measured", passes; NaN does not)."""
     if value is not None and not low <= value <= high:

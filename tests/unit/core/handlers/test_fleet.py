@@ -136,23 +136,6 @@ def test_the_same_file_again_changes_nothing(seed: int) -> None:
             assert node.handle(event, now) == other.handle(event, now)
 
 
-def test_a_task_on_its_way_to_another_cell_is_a_problem_until_no_document_says_so() -> None:
-    node = node_of(FLEET)
-    node.start(START)
-    before = build_snapshot(node, START).problems
-    batch = adopt(node, replace(FLEET, handed=(("count", "hall-b"),)))
-    assert not kinds(batch) & {do.AdoptFleet, do.RecordStory}, "it orders nothing"
-    (told,) = (problem for problem in build_snapshot(node, START).problems if problem not in before)
-    assert told.startswith(
-        "count is on its way to hall-b, and stays so unless somebody's `zsched task hand` is at work"
-    )
-    assert told.endswith(
-        f"`zsched task hand count hall-b` goes on, `zsched task hand count {FLEET.name}` takes it back"
-    )
-    adopt(node, FLEET)
-    assert build_snapshot(node, START).problems == before
-
-
 def test_electors_and_leases_stay_until_they_are_agreed() -> None:
     node = node_of(FLEET)
     node.start(START)
