@@ -149,6 +149,7 @@ class Recipes:
             "ZENOH_RUNTIME": pools,
             "ZSCHED_ZENOH_CONFIG": path,
             "ZENOH_SESSION_CONFIG_URI": path,  # a ROS node (rmw_zenoh) joins the data network by this
+            "ZENOH_CONFIG": path,  # and whatever opens a session by zenoh's own variable (`Config.from_env`)
         }
         if task.tuning.deadline_ms is not None:
             made |= {"ZSCHED_DEADLINE_MS": f"{task.tuning.deadline_ms:g}"}

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from support.fleets import fleet_of, task_of
 from zsched.core.values.fleet import WorkerLink, WorkerSpec
@@ -88,3 +89,13 @@ def test_a_change_that_is_taken_back_after_half_of_its_sessions_were_written_tak
     monkeypatch.undo()
     recipes.adopt(fleet, HERE, dials_by_gossip=False)
     assert recipes.paths["merge"].read_text() == before
+
+
+def test_a_program_that_knows_zenohs_own_variable_joins_the_data_network(
+    recipes: Recipes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipes.adopt(fleet_of(MERGE), HERE, dials_by_gossip=False)
+    environment = recipes.environment("merge")
+    assert environment["ZENOH_CONFIG"] == environment["ZENOH_SESSION_CONFIG_URI"] == str(recipes.paths["merge"])
+    monkeypatch.setenv("ZENOH_CONFIG", environment["ZENOH_CONFIG"])
+    assert HERE[0] in zenoh.Config.from_env().get_json("connect/endpoints")
