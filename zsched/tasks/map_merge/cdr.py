@@ -22,6 +22,7 @@ from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, Grid
 _LITTLE, _BIG = b"\x00\x01", b"\x00\x00"
 _HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000
+MAX_STAMP_NS = (1 << 31) * _NS - 1
 MAX_STRING = 4096
 MAX_TRANSFORMS = 4096
 MAX_TILT_RAD = 0.02

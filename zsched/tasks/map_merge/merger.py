@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from enum import StrEnum
@@ -87,14 +88,16 @@ class RobotStatus(Struct, frozen=True, kw_only=True):
 class MergeResult(Struct, frozen=True, kw_only=True, eq=False):
     """One merge: the map (``None``: nothing to publish yet), every robot's status, and the attached map frames.
 
-    ``transforms`` {robot: pose of its map frame in the world}; ``inputs`` {robot: stamp_ns} of the merged grids;
-    ``revision`` rises whenever a transform changed; ``is_search_due``: merge again soon, a search waits.
+    ``transforms`` {robot: its map frame in the world}; ``inputs`` {robot: stamp_ns} and ``frames`` {robot: child
+    frame of its transform} of the merged grids, while the map has no stamp yet; ``revision`` rises whenever a transform
+    changed; ``is_search_due``: merge again soon, a search waits.
     """
 
     grid: Grid | None
     statuses: tuple[RobotStatus, ...]
     transforms: Mapping[str, Pose2]
     inputs: Mapping[str, int]
+    frames: Mapping[str, str]
     reference: str | None
     revision: int
     is_search_due: bool
@@ -194,6 +197,7 @@ class Merger:
             statuses=tuple(self._status(robot, attached, oversize) for robot in sorted(self._robots())),
             transforms=attached,
             inputs={robot: grids[robot].stamp_ns for robot in attached},
+            frames={robot: _child_frame(robot, grids[robot].frame_id) for robot in attached},
             reference=self._reference,
             revision=self._revision,
             is_search_due=is_search_due,
@@ -313,7 +317,6 @@ class Merger:
             [(grids[robot], pose) for robot, pose in attached.items()],
             self._extent,
             self._settings.resolution,
-            stamp_ns=max(grids[robot].stamp_ns for robot in attached),
             frame_id=self._settings.world_frame,
         )
 
@@ -351,6 +354,12 @@ class Merger:
         if refused:
             return _with_figures(robot, RobotState.REFUSED, refused[0].reason, refused[0])
         return RobotStatus(robot=robot, state=RobotState.WAITING, reason=self._pairs.pending_reason(robot))
+
+
+def _child_frame(robot: str, frame_id: str) -> str:
+    """The map's own frame, where that names the robot: all robots hear the transforms, and many have a ``map``."""
+    names_it = re.search(rf"(?<![A-Za-z0-9]){re.escape(robot)}(?![A-Za-z0-9])", frame_id) is not None
+    return frame_id if names_it else f"{robot}/map"
 
 
 def _with_figures(robot: str, state: RobotState, reason: str, edge: Alignment) -> RobotStatus:

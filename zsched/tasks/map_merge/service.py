@@ -20,10 +20,18 @@ from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Any, Protocol
 
-from zsched.core.values.struct import Struct
+from zsched.clock import wall_ns
+from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.guard import guarded
-from zsched.tasks.map_merge.cdr import CdrError, StampedTransform, decode_grid, encode_grid, encode_transforms
+from zsched.tasks.map_merge.cdr import (
+    MAX_STAMP_NS,
+    CdrError,
+    StampedTransform,
+    decode_grid,
+    encode_grid,
+    encode_transforms,
+)
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched.tasks.map_merge.merger import MAX_ROBOTS, Merger, MergeResult, MergerSettings, RobotStatus
@@ -105,6 +113,7 @@ class MapMergeService:
         rate_hz: float = 4.0,
         job: Callable[[int], AbstractContextManager[object]] = _untold,
         spawn: Callable[[Callable[[], None]], None] = _in_thread,
+        wall_clock: Callable[[], int] = wall_ns,
     ) -> None:
         self._settings = settings
         self._publish = publish
@@ -112,6 +121,7 @@ class MapMergeService:
         self._period_s = 1.0 / rate_hz
         self._job = job
         self._spawn = spawn
+        self._wall_clock = wall_clock
         self._merger = Merger(settings, searches_itself=False)
         self._found: queue.SimpleQueue[tuple[SearchJob, Estimate | None]] = queue.SimpleQueue()
         self._is_searching = False
@@ -248,9 +258,24 @@ class MapMergeService:
         self._merge_ms = 1e3 * (self._clock() - started_s)
         self._merges += 1
         self._log_changes(result)
+        if result.grid is not None:
+            result = replace(result, grid=replace(result.grid, stamp_ns=self._stamp_ns(result.inputs)))
         self._result, self._snapshot = result, self._merger.snapshot()
         self._publish_result(result)
         self._search()
+
+    def _stamp_ns(self, inputs: Mapping[str, int]) -> int:
+        """When the newest map was made: the middle one of what the robots' clocks say, which no wrong one moves.
+
+        Each clock is read by its robot's own map and how long that has been here. Of an even number of clocks the
+        middle is found with this machine's.
+        """
+        taken = {robot: self._inputs[robot].taken_s or 0.0 for robot in inputs}
+        newest_s = max(taken.values())
+        told = [stamp_ns + round((newest_s - taken[robot]) * 1e9) for robot, stamp_ns in inputs.items()]
+        if len(told) % 2 == 0:
+            told.append(self._wall_clock())
+        return min(sorted(told)[len(told) // 2], MAX_STAMP_NS)
 
     def _merged(self, pending: Mapping[str, Grid | None]) -> MergeResult:
         for robot, grid in pending.items():
@@ -339,7 +364,7 @@ class MapMergeService:
 
 def _transforms(result: MergeResult, world_frame: str) -> tuple[StampedTransform, ...]:
     return tuple(
-        StampedTransform(parent=world_frame, child=f"{robot}/map", pose=pose, stamp_ns=result.inputs[robot])
+        StampedTransform(parent=world_frame, child=result.frames[robot], pose=pose, stamp_ns=result.inputs[robot])
         for robot, pose in result.transforms.items()
     )
 
@@ -355,6 +380,7 @@ def _robot_fields(status: RobotStatus | None, book: _Input, result: MergeResult 
         "overlap": None if status is None else _rounded(status.overlap),
         "margin": None if status is None else _rounded(status.margin),
         "pose": None if pose is None else _pose_fields(pose),
+        "frame": None if result is None or status is None else result.frames.get(status.robot),
         "map_age_s": None if book.taken_s is None else round(now - book.taken_s, 3),
         "maps": book.maps,
         "bad": book.bad,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
+from zsched.tasks.map_merge.cdr import MAX_STAMP_NS, decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched.tasks.map_merge.merger import MAX_ROBOTS, MergerSettings, Mode
@@ -20,6 +20,9 @@ from zsched.tasks.map_merge.service import STATUS_SCHEMA, MapMergeService, Outpu
 
 View = Callable[[tuple[float, float, float, float], Pose2], Grid]
 _POSES = {"robot1": Pose2(x=2.0, y=-1.0, yaw=0.4), "robot2": Pose2(x=-3.0, y=2.0, yaw=-2.2)}
+_THIRD = Pose2(x=1.0, y=1.0)
+_NOW_NS = 1_700_000_000 * 10**9
+_WEEK_NS = 7 * 86_400 * 10**9
 _PARTS = {"robot1": (0.0, 0.0, 14.0, 16.0), "robot2": (7.0, 0.0, 24.0, 16.0)}
 
 
@@ -46,8 +49,10 @@ class _Wire:
 
 
 def _service(wire: _Wire, mode: Mode = Mode.KNOWN) -> MapMergeService:
-    settings = MergerSettings(mode=mode, poses=_POSES if mode is Mode.KNOWN else {})
-    return MapMergeService(settings, wire.publish, clock=wire.clock, rate_hz=4.0, spawn=lambda work: work())
+    settings = MergerSettings(mode=mode, poses={**_POSES, "robot3": _THIRD} if mode is Mode.KNOWN else {})
+    return MapMergeService(
+        settings, wire.publish, clock=wire.clock, rate_hz=4.0, spawn=lambda work: work(), wall_clock=lambda: _NOW_NS
+    )
 
 
 def _feed(service: MapMergeService, view: View, *robots: str) -> None:
@@ -96,6 +101,46 @@ def test_merge_publishes_map_transforms_and_status(view: View) -> None:
     assert (status["mode"], status["merges"], status["revision"]) == ("known", 1, 1)
     assert status["robots"]["robot1"]["state"] == "attached"
     assert status["robots"]["robot1"]["map_age_s"] == 0.0
+
+
+@pytest.mark.parametrize("wrong_ns", [_NOW_NS + _WEEK_NS, _NOW_NS - _WEEK_NS, 0, -5, MAX_STAMP_NS])
+@pytest.mark.parametrize("robots", [2, 3])
+def test_a_wrong_clock_does_not_date_the_merged_map(view: View, wrong_ns: int, robots: int) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    names = [f"robot{number}" for number in range(1, robots + 1)]
+    for name in names:
+        stamp_ns = wrong_ns if name == "robot1" else _NOW_NS - 1000
+        service.receive(name, encode_grid(replace(view(_PARTS["robot1"], _POSES["robot1"]), stamp_ns=stamp_ns)))
+    assert service.step(is_active=True)
+    assert abs(decode_grid(wire.last(Output.GLOBAL_MAP)[0]).stamp_ns - _NOW_NS) <= 1000
+    attachment = wire.last(Output.GLOBAL_MAP)[1]
+    assert attachment is not None
+    assert json.loads(attachment)["inputs"]["robot1"] == wrong_ns, "what came is told as it came"
+
+
+def test_a_robot_that_is_silent_does_not_hold_the_time_up(view: View) -> None:
+    wire = _Wire()
+    service = _service(wire)
+    for after_s, robot in ((0.0, "robot1"), (60.0, "robot2")):
+        wire.now_s += after_s
+        grid = replace(view(_PARTS[robot], _POSES[robot]), stamp_ns=_NOW_NS + round((after_s - 60) * 1e9))
+        service.receive(robot, encode_grid(grid))
+    assert service.step(is_active=True)
+    assert decode_grid(wire.last(Output.GLOBAL_MAP)[0]).stamp_ns == _NOW_NS
+
+
+def test_a_map_frame_that_names_its_robot_is_the_child_frame(view: View) -> None:
+    """Every robot hears all transforms: a `map` that each has would be placed where another robot's is."""
+    frames = {"robot1": "robot1_map", "robot2": "map"}
+    wire = _Wire()
+    service = _service(wire)
+    for robot, frame_id in frames.items():
+        service.receive(robot, encode_grid(replace(view(_PARTS[robot], _POSES[robot]), frame_id=frame_id)))
+    service.step(is_active=True)
+    transforms = decode_transforms(wire.last(Output.TF)[0])
+    assert [one.child for one in transforms] == ["robot1_map", "robot2/map"]
+    assert [wire.status()["robots"][robot]["frame"] for robot in frames] == ["robot1_map", "robot2/map"]
 
 
 def test_idle_keeps_the_newest_maps_and_the_owner_merges_them_at_once(view: View) -> None:
