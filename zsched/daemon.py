@@ -39,7 +39,8 @@ from zsched.config.load import load_fleet, require_node
 from zsched.core import events as ev
 from zsched.core.node import Node, in_parts
 from zsched.core.status import status_line
-from zsched.core.values.fleet import Fleet, WorkerLink, dial_endpoint, electorate_hash, fleet_hash
+from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.fleet import Fleet, WorkerLink, electorate_hash, fleet_hash
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.snapshot import Exposure
 from zsched.core.values.struct import Struct
@@ -199,7 +200,7 @@ class Daemon:
             flags=stored.flags,
         )
         node.solitude.dialled = points.control_connect
-        node.solitude.dialled_at = dial_endpoint(self._spec.listen_control, self._spec.host)
+        node.solitude.dialled_at = self._spec.control_at
         node.joins_at = joins_at(self._spec, points.worker_connect[:1])
         node.has_foreign_state = restored.is_foreign
         node.has_others_state, node.lacks_state_file = restored.is_others, restored.is_missing
@@ -239,9 +240,8 @@ class Daemon:
     def _data_port(self, stack: contextlib.ExitStack) -> int:
         """A port for the data session: that of the relay that may be taken over, else the default, else a free one."""
         note = self._door.note()
-        port = "" if note is None else note.listen.partition("#")[0].rpartition(":")[2]
-        if port.isdigit():
-            return int(port)
+        if note is not None and (port := Endpoint.of(note.listen).port):
+            return port
         claim = claim_port(DATA_PORT)
         if claim is None:
             return free_port()
@@ -376,7 +376,10 @@ class Daemon:
         gossiped = self._watch.gossiped
         if not self._spec.local or not gossiped:
             return points.data_listen
-        return tuple(dial_endpoint(points.data_listen[0], host) for host in ("127.0.0.1", *gossiped))
+        listen, here = Endpoint.of(points.data_listen[0]), Endpoint.of(points.worker_connect[0])
+        if not listen.is_everywhere:
+            return points.data_listen
+        return tuple(str(listen.at(host)) for host in (here.host, *gossiped) if host)
 
     def _streams(self) -> tuple[Path, str] | None:
         """The socket for an application that has its streams itself, and where that listens."""

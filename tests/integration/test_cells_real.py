@@ -19,7 +19,7 @@ import pytest
 from support.authorities import install, make_authority
 from support.waiting import until
 from zsched.core.values.certificates import Role
-from zsched.core.values.fleet import dial_endpoint
+from zsched.core.values.endpoint import Endpoint
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 pytestmark = pytest.mark.timeout(180)
@@ -52,7 +52,7 @@ class Cell:
 def gateways(tree: Json) -> list[str]:
     """Where a cell is asked: two of its nodes."""
     nodes: Json = tree["nodes"]
-    return [dial_endpoint(nodes[name]["listen"]["control"], nodes[name]["host"]) for name in ("edge1", "edge2")]
+    return [Endpoint.of(nodes[name]["listen"]["control"]).dialled(nodes[name]["host"]) for name in ("edge1", "edge2")]
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import pytest
 
 from zsched.adapters.network.fleet_client import FleetClient
 from zsched.core.values.document import Document, Text
-from zsched.core.values.fleet import dial_endpoint
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 from zsched.sessions import config as zenoh_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.long
 def adopt(bed: Testbed) -> None:
     """Agree the file as the fleet's document."""
     spec = bed.fleet.node("robot1")
-    endpoint = dial_endpoint(spec.listen_control, spec.host)
+    endpoint = spec.control_at
     config = zenoh_config.client_config(connect=(endpoint,), timing=bed.fleet.timing)
     client = FleetClient(endpoint, config, "operator")
     try:

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from zsched.adapters.network.fleet_client import FleetClient
-from zsched.core.values.fleet import dial_endpoint
 from zsched.core.values.messages import CommandOutcome, CommandResult, MoveTask
 from zsched.core.values.model import Asked, NodeId
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
@@ -34,7 +33,7 @@ def run(bed: Testbed, verb: str, node: NodeId, *more: str) -> subprocess.Complet
 def move(bed: Testbed, owner: NodeId) -> None:
     """Give the task to a node."""
     spec = bed.fleet.node("robot4")
-    endpoint = dial_endpoint(spec.listen_control, spec.host)
+    endpoint = spec.control_at
     client = FleetClient(endpoint, zenoh_config.client_config(connect=(endpoint,), timing=bed.fleet.timing), "operator")
     try:
         answer = client.ask("robot4", MoveTask(task=TASK, node=owner, asked=Asked(by="operator")))

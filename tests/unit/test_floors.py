@@ -59,7 +59,19 @@ CORE_MAY: Final = frozenset(
             "functools",
             "hashlib",
         ),
-        *("abc", "heapq", "itertools", "math", "operator", "random", "re", "statistics", "types", "typing"),
+        *(
+            "abc",
+            "heapq",
+            "ipaddress",
+            "itertools",
+            "math",
+            "operator",
+            "random",
+            "re",
+            "statistics",
+            "types",
+            "typing",
+        ),
     }
 )
 """Pure parts of the standard library; ``random`` only for the type `Random` (generators come in seeded)."""

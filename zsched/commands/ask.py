@@ -19,6 +19,7 @@ from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
 from zsched.clock import wall_s
 from zsched.commands.common import BECOME_A_NODE, CliError, Json, check_name, nearest
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, ConfigError, WireError
@@ -360,14 +361,12 @@ def endpoint_of(text: str) -> str:
     Raises:
         CliError: it is no endpoint that could be dialled.
     """
-    protocol, slash, address = text.partition("/")
-    protocol, address = (protocol, address) if slash else ("tcp", text)
-    if not address.rpartition("]")[2].count(":"):
-        address = f"{address}:{CONTROL_PORT}"
-    host, _, port = address.rpartition(":")
-    if not protocol or not host or not port.isdigit():
+    full = text if "/" in text else f"tcp/{text}"
+    if ":" not in full.rpartition("]")[2]:
+        full = f"{full}:{CONTROL_PORT}"
+    if not Endpoint.of(full).dialled(""):
         raise CliError(EXIT_USAGE, f"--connect: {text!r} is no endpoint; write tcp/robot1:{CONTROL_PORT}")
-    return f"{protocol}/{address}"
+    return full
 
 
 def _ask_elsewhere(door: Door, request: Json) -> Json:

@@ -35,10 +35,10 @@ from zsched.commands.papers import (
 from zsched.commands.pki import check_held
 from zsched.config.editing import add_entries, add_names, is_list
 from zsched.config.load import check_bytes
-from zsched.config.schema import is_loopback
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.endpoint import Endpoint, is_loopback
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.struct import Struct
 from zsched.errors import WireError, ZschedError
@@ -111,10 +111,9 @@ class Address(Struct, frozen=True, kw_only=True):
 
     def entry(self, protocol: str) -> str:
         """The part of a node's entry in the fleet file that says so."""
-        where = f"[{self.listened_host}]" if ":" in self.listened_host else self.listened_host
-        listen = ", ".join(
-            f'{kind}: "{protocol}/{where}:{port}"' for kind, port in (("control", self.port), ("data", self.port + 1))
-        )
+        end = Endpoint(protocol=protocol, address="")
+        ports = {"control": self.port, "data": self.port + 1}
+        listen = ", ".join(f'{kind}: "{end.at(self.listened_host, port)}"' for kind, port in ports.items())
         return f'host: "{self.host}", listen: {{{listen}}}'
 
 
@@ -401,20 +400,15 @@ def _without_keys(text: str, labels: Sequence[str]) -> str:
 
 def dial_order(fleet: Fleet) -> tuple[NodeId, ...]:
     """The nodes that can be dialled, each after those that it dials."""
-    others = [node.name for node in fleet.nodes if node.name not in fleet.seeds and _can_be_dialled(node)]
+    others = [node.name for node in fleet.nodes if node.name not in fleet.seeds and node.can_be_dialled]
     return (*fleet.seeds, *others)
-
-
-def _can_be_dialled(node: NodeSpec) -> bool:
-    ends = (node.listen_control, node.listen_data)
-    return all(endpoint and dial_endpoint(endpoint, node.host) for endpoint in ends)
 
 
 def protocol_of(fleet: Fleet) -> str:
     """With which the others listen."""
     if fleet.security is not None:
         return SECURED
-    said = [node.listen_control.partition("/")[0] for node in fleet.nodes if node.listen_control]
+    said = [Endpoint.of(node.listen_control).protocol for node in fleet.nodes if node.listen_control]
     return said[0] if said else "tcp"
 
 
@@ -440,7 +434,7 @@ def invitation_for(door: Door, guest: Guest, secret: bytes) -> Invitation:
     except (KeyError, WireError) as error:
         raise CliError(EXIT_FAILED, f"{told['node']} does not tell its fleet value: update zsched there") from error
     fleet = fleet_of(document.text)
-    addresses = [dial_endpoint(node.listen_control, node.host) for node in fleet.nodes if node.name != guest.name]
+    addresses = [node.control_at for node in fleet.nodes if node.name != guest.name]
     papers = papers_for(fleet, guest.name, guest.authority, guest.request, secret)
     return Invitation(
         node=guest.name,

@@ -18,7 +18,7 @@ from zsched.adapters.network.node_ping import Pinged, ping
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, fleet_here, name_here
 from zsched.commands.common import CliError, Json, nearest, print_json, say
-from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import Struct
@@ -94,7 +94,7 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
     """The node's own addresses, measured at the same time."""
     spec, keys, text = fleet.node(question.node), Keyspace(fleet.name), session_text(fleet, Side.VISIT)
     selectors = {CONTROL: keys.status(spec.name, asker_in(fleet, me)), DATA: keys.role(spec.name, "*")}
-    dialled = [(name, endpoint) for name, endpoint in _addresses(spec) if endpoint]
+    dialled = [(name, endpoint) for name, endpoint in ((CONTROL, spec.control_at), (DATA, spec.data_at)) if endpoint]
 
     def measured(one: tuple[str, str]) -> Way:
         name, endpoint = one
@@ -114,11 +114,6 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
         yield from pool.map(measured, dialled)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)  # Ctrl-C waits for no answer
-
-
-def _addresses(spec: NodeSpec) -> tuple[tuple[str, str], ...]:
-    listens = ((CONTROL, spec.listen_control), (DATA, spec.listen_data))
-    return tuple((name, dial_endpoint(listen, spec.host) if listen else "") for name, listen in listens)
 
 
 def _own_status(socket: Path) -> Json | None:

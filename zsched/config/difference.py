@@ -31,7 +31,6 @@ from zsched.core.values.fleet import (
     TaskSpec,
     WorkerLink,
     WorkerSpec,
-    dial_endpoint,
     runs_worker,
 )
 from zsched.core.values.model import NodeId, NodeKind, TaskId, Weights
@@ -352,7 +351,7 @@ def _by_gossip(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
 def _hidden(fleet: Fleet) -> set[NodeId]:
     """The robots that workers cannot dial by the file, and find by gossip."""
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT]
-    return {one.name for one in robots if not (one.listen_data and dial_endpoint(one.listen_data, one.host))}
+    return {one.name for one in robots if not one.data_at}
 
 
 def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
@@ -418,11 +417,7 @@ def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
 
 def _addresses(fleet: Fleet) -> dict[NodeId, set[str]]:
     """{robot: where workers dial its data session, and an application of its that has its streams itself}."""
-    return {
-        node.name: {dial_endpoint(end, node.host) for end in (node.listen_data, node.listen_streams)} - {""}
-        for node in fleet.nodes
-        if node.kind is NodeKind.ROBOT
-    }
+    return {node.name: {node.data_at, node.streams_at} - {""} for node in fleet.nodes if node.kind is NodeKind.ROBOT}
 
 
 def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:

@@ -21,7 +21,7 @@ from zsched.config.tasks import check_secured, read_tasks
 from zsched.config.timing import WIFI, timing_faults
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.values.document import MAX_DOCUMENT_BYTES
-from zsched.core.values.fleet import Fleet, NodeSpec, Timing, dial_endpoint
+from zsched.core.values.fleet import Fleet, Timing
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
@@ -215,7 +215,7 @@ def _changed(base: Timing, changes: Mapping[str, float]) -> Timing:
 def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
     given: tuple[Located[str], ...] | None = section.get("seeds")
     if given is None:
-        seeds = tuple(node.name for node in cast.nodes if _can_be_dialled(node))[:_SEEDS]
+        seeds = tuple(node.name for node in cast.nodes if node.can_be_dialled)[:_SEEDS]
         is_sound = cast.is_whole and cast.sound == set(cast.names)  # a faulty `listen:` is told of in its own place
         if not seeds and len(cast.names) > 1 and is_sound and "seeds" not in section.places:
             message = "no node can be dialled, so none would find another"
@@ -224,16 +224,10 @@ def _seeds(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:
         return seeds
     for seed in cast.known(given, out):
         node = next((node for node in cast.nodes if node.name == seed.value), None)
-        if node is not None and node.name in cast.sound and not _can_be_dialled(node):
+        if node is not None and node.name in cast.sound and not node.can_be_dialled:
             hint = "it needs `listen: {control:, data:}` with fixed ports, and a `host:` when it listens on 0.0.0.0"
             out.error(seed.place, f"the seed {seed.value!r} cannot be dialled", hint)
     return tuple(dict.fromkeys(seed.value for seed in given))
-
-
-def _can_be_dialled(node: NodeSpec) -> bool:
-    """Control and data are meshes of their own, and both grow from the seeds."""
-    endpoints = (node.listen_control, node.listen_data)
-    return all(endpoint and dial_endpoint(endpoint, node.host) for endpoint in endpoints)
 
 
 def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...]:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from zsched.config.blocks import Located, Section
 from zsched.config.reader import Collector, Place, nearest
-from zsched.core.values.fleet import LinkSpec, LocalMode, LocalSide, NodeSpec, dial_endpoint
+from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.fleet import LinkSpec, LocalMode, LocalSide, NodeSpec
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.profile import LinkSource
 from zsched.core.values.struct import Struct
@@ -104,7 +105,7 @@ def _node(name: str, given: Section, names: tuple[str, ...], folder: Path, out: 
 
 def _streams(given: Section, listen: Section, out: Collector) -> str:
     endpoint: str = listen.get("streams", "")
-    if endpoint and not dial_endpoint(endpoint, given.get("host", "")):
+    if endpoint and not Endpoint.of(endpoint).dialled(given.get("host", "")):
         message = "no worker can dial an application there"
         out.error(listen.where("streams"), message, "give it a fixed port, and the node a `host:`")
     if endpoint and given.get("kind") is NodeKind.EDGE:
@@ -128,18 +129,15 @@ def _local(given: Section, out: Collector) -> LocalSide | None:
     elif not connect and not listen and section.is_whole:
         out.error(section.place, "it neither dials nor listens: nobody would be on it", "add connect or listen")
     own: Section | None = given.get("listen")
-    ports = {_port(own.get(kind)): kind for kind in ("control", "data") if kind in own.values} if own else {}
+    kinds = ("control", "data")
+    ports = {Endpoint.of(own.get(kind)).port: kind for kind in kinds if kind in own.values} if own else {}
     for endpoint in (*connect, *listen):
-        is_here = any(word in endpoint.value for word in ("/127.", "/localhost:", "/[::1]:", "/0.0.0.0:", "/[::]:"))
-        kind = ports.get(_port(endpoint.value)) if is_here else None
+        end = Endpoint.of(endpoint.value)
+        kind = ports.get(end.port) if end.is_own_host or end.is_everywhere else None
         if kind is not None:
             hint = "the local side is another network: a router or port of its own"
             out.error(endpoint.place, f"{endpoint.value} is this node's own {kind} session", hint)
     return LocalSide(mode=mode, connect=tuple(one.value for one in connect), listen=tuple(one.value for one in listen))
-
-
-def _port(endpoint: str) -> str:
-    return endpoint.partition("#")[0].partition("?")[0].rpartition(":")[2]
 
 
 # --- endpoints -------------------------------------------------------------------------------------------------------
@@ -156,10 +154,10 @@ def _check_endpoints(entries: dict[str, Located[Section | None]], out: Collector
         for kind in ("control", "data", "streams"):
             # a node without a host listens "everywhere", but on its own machine
             endpoint = listen.get(kind, "")
-            address = dial_endpoint(endpoint, section.get("host", "") or name).partition("?")[0].partition("#")[0]
-            if not address:
+            dialled = Endpoint.of(endpoint).dialled(section.get("host", "") or name)
+            if not dialled:
                 continue
-            owner = taken.setdefault(address, f"{name}'s {kind} session")
+            owner = taken.setdefault(Endpoint.of(dialled).place, f"{name}'s {kind} session")
             if owner != f"{name}'s {kind} session":
                 out.error(
                     listen.where(kind),

@@ -32,6 +32,7 @@ from zsched.config.ros2 import ros2_record
 from zsched.config.timing import PROFILES
 from zsched.core.scheduler.patience import CHOICES
 from zsched.core.values.certificates import parse_label
+from zsched.core.values.endpoint import HOST_PORT, WITH_PATH, Endpoint
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_COOL_DOWN_S,
@@ -65,8 +66,6 @@ from zsched.core.values.model import (
 from zsched.core.values.plan import ServiceSettings, StreamSettings
 
 PKI_FOLDER: Final = "pki"
-_HOST_PORT: Final = ("tcp", "udp", "tls", "quic", "ws")
-_WITH_PATH: Final = ("unixsock-stream", "unixpipe", "serial", "vsock")
 _HOST: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?:\.(?!-)[A-Za-z0-9_-]{1,63})*\.?")
 _MAC: Final = re.compile(r"[0-9a-fA-F]{2}(:[0-9a-fA-F]{2}){5}")
 _ENV_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -76,54 +75,32 @@ _INTERFACE: Final = re.compile(r"[^\s/]{1,15}")
 def host_fault(text: str) -> str | None:
     """Why ``text`` is no host name, IPv4 or IPv6 address."""
     try:
-        ipaddress.ip_address(text)
+        address = ipaddress.ip_address(text)
     except ValueError:
         is_number = re.fullmatch(r"[0-9.]+", text) is not None
         if not is_number and len(text) <= 253 and _HOST.fullmatch(text) is not None:
             return None
         return "not an address" if is_number else "letters, digits, '-' and '.' only"
+    if address.version == 6 and (address.is_link_local or "%" in text):
+        return "an address of one card (link-local, with a zone) cannot be dialled from elsewhere: give another one"
     return None
 
 
 def endpoint_fault(text: str) -> str | None:
-    """Why ``text`` is no zenoh endpoint (``PROTOCOL/ADDRESS[?metadata][#config]``)."""
-    protocol, slash, rest = text.partition("/")
-    address = re.split(r"[?#]", rest, maxsplit=1)[0]
-    if not slash or protocol not in _HOST_PORT + _WITH_PATH:
-        return f"it must begin with one of {', '.join(name + '/' for name in _HOST_PORT + _WITH_PATH)}"
-    if protocol in _WITH_PATH:
-        return None if address else "nothing follows the protocol"
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isascii() or not port.isdigit() or len(port) > 5 or int(port) > 65535:
+    """Why ``text`` is no zenoh endpoint (``PROTOCOL/ADDRESS[?metadata][#options]``)."""
+    end = Endpoint.of(text)
+    if not text.startswith(f"{end.protocol}/") or end.protocol not in HOST_PORT + WITH_PATH:
+        return f"it must begin with one of {', '.join(name + '/' for name in HOST_PORT + WITH_PATH)}"
+    if str(end) != text or "?" in end.options:
+        return "behind the address come ?metadata, then #options, neither of them empty"
+    if end.protocol in WITH_PATH:
+        return None if end.address else "nothing follows the protocol"
+    if end.port is None or end.port > 65535:
         return "it must end with ':PORT', PORT 0..65535"
+    host = end.address.rpartition(":")[0]
     if host.startswith("[") and host.endswith("]"):
         return host_fault(host[1:-1]) if ":" in host else "brackets are for IPv6 addresses"
     return "an IPv6 address stands in brackets" if ":" in host else host_fault(host)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host is an address that only this machine reaches; a name is none.
-
-    >>> [is_loopback(host) for host in ("127.0.0.1", "[::1]", "192.0.2.1", "localhost", "")]
-    [True, True, False, False, False]
-    """
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
-def is_own_host(endpoint: str) -> bool:
-    """Whether only programs of its machine reach a listener at a zenoh endpoint; a name but ``localhost`` is no proof.
-
-    >>> [is_own_host(f"{end}:1") for end in ("tcp/127.1.2.3", "tcp/[::1]", "ws/localhost", "tcp/0.0.0.0", "tcp/box")]
-    [True, True, True, False, False]
-    """
-    protocol, _, address = endpoint.partition("/")
-    if protocol in ("unixsock-stream", "unixpipe"):
-        return True
-    host = address.partition("#")[0].partition("?")[0].rpartition(":")[0]
-    return host == "localhost" or is_loopback(host)
 
 
 def _matches(pattern: re.Pattern[str], why: str) -> Any:

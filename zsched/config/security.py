@@ -12,8 +12,9 @@ from pathlib import Path
 from zsched.config.blocks import Located, Section
 from zsched.config.nodes import Cast
 from zsched.config.reader import Collector
-from zsched.config.schema import PKI_FOLDER, is_own_host
+from zsched.config.schema import PKI_FOLDER
 from zsched.core.values.certificates import MAX_COMMON_NAME, Holder, Role, parse_label
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Security, Signatures
 from zsched.core.values.struct import replace
 
@@ -110,12 +111,12 @@ def _check_endpoints(section: Section, given: Section, out: Collector) -> None:
             assert listen is not None
             endpoint = listen.get(kind, "")
             if endpoint and not endpoint.startswith(ENCRYPTED):
-                plain, _, address = endpoint.partition("/")
+                plain = endpoint.partition("/")[0]
                 message = f"{plain}/ is plain text, and the fleet is secured (line {given.place.line})"
-                out.error(listen.where(kind), message, f"tls/{address}")
+                out.error(listen.where(kind), message, endpoint.replace(plain, "tls", 1))
         local: Section | None = entry.value.get("local") if entry.value is not None else None
         ends: tuple[Located[str], ...] = () if local is None else local.get("listen", ())
         for end in ends:
-            if not is_own_host(end.value):
+            if not Endpoint.of(end.value).is_own_host:
                 message = f"{end.value}: other machines reach this local side, and it has no certificates"
                 out.warn(end.place, message, "who reaches it speaks as the node's applications: listen on 127.0.0.1")

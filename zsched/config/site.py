@@ -11,7 +11,8 @@ from zsched.config.blocks import Located, Section
 from zsched.config.nodes import warn_missing
 from zsched.config.reader import Collector
 from zsched.config.security import ENCRYPTED
-from zsched.core.values.fleet import Cell, dial_endpoint
+from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.fleet import Cell
 
 ENOUGH = 2
 """Gateways of a cell: with one, its machine's death hides the cell."""
@@ -46,7 +47,7 @@ def read_site(section: Section, folder: Path, out: Collector) -> tuple[Cell, ...
 
 def _check_gateway(cell: str, gateway: Located[str], seen: dict[str, str], out: Collector) -> None:
     endpoint = gateway.value
-    if not dial_endpoint(endpoint, ""):
+    if not Endpoint.of(endpoint).dialled(""):
         out.error(gateway.place, f"{endpoint} cannot be dialled", 'name an address, for example "tcp/192.0.2.31:7457"')
     elif endpoint in seen:
         out.error(gateway.place, f"{endpoint} is a gateway of {seen[endpoint]!r} already", "name another node of it")

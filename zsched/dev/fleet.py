@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from zsched.config import reader
 from zsched.config.load import check_bytes
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
@@ -112,7 +113,7 @@ def _left_out(root: reader.Mapping) -> list[str]:
 def _node_here(given: reader.Node | None, addresses: Addresses) -> reader.Mapping:
     assert isinstance(given, reader.Mapping)
     kept = tuple((key, value) for key, value in given.pairs if key.text in KEPT)
-    host = addresses.data.partition("/")[2].rpartition(":")[0]
+    host = Endpoint.of(addresses.data).host
     listen = {"control": addresses.control, "data": addresses.data}
     if addresses.streams:
         listen["streams"] = addresses.streams

@@ -22,7 +22,7 @@ from zsched.config.load import CheckResult, check_bytes, check_file
 from zsched.core.electorate.numbers import in_force
 from zsched.core.report import snapshot_json
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet, dial_endpoint
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, replace
 from zsched.doctor.fleet import differs
@@ -192,8 +192,7 @@ def _through(door: Path, node: NodeId) -> tuple[Json | None, float]:
 
 
 def _directly(fleet: Fleet, asker: NodeId, missing: list[NodeId]) -> list[Json]:
-    specs = [spec for spec in fleet.nodes if spec.name in missing and spec.listen_control]
-    endpoints = [end for spec in specs if (end := dial_endpoint(spec.listen_control, spec.host))]
+    endpoints = [spec.control_at for spec in fleet.nodes if spec.name in missing and spec.control_at]
     try:
         text, asker = session_text(fleet, Side.VISIT), asker_in(fleet, asker)
         configs = [

@@ -17,8 +17,8 @@ from concurrent.futures import TimeoutError as LateError
 from pathlib import Path
 from typing import Final
 
-from zsched.config.schema import is_loopback
-from zsched.core.values.fleet import NodeSpec, dial_endpoint
+from zsched.core.values.endpoint import OVER_TCP, Endpoint, is_loopback
+from zsched.core.values.fleet import NodeSpec
 from zsched.core.values.struct import Struct
 from zsched.doctor.model import Result, Scene, counted, failed, joined, passed, skipped, warned
 from zsched.procfs import names, read_file
@@ -41,14 +41,13 @@ class Address(Struct, frozen=True, kw_only=True):
     @property
     def is_stream(self) -> bool:
         """Whether a TCP connection says something of it."""
-        return self.endpoint.partition("/")[0] in ("tcp", "tls")
+        return Endpoint.of(self.endpoint).protocol in OVER_TCP
 
     @property
     def place(self) -> tuple[str, int]:
-        """(host, port)."""
-        address = self.endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-        host, _, port = address.rpartition(":")
-        return host.strip("[]"), int(port)
+        """(host, port); of a path none."""
+        end = Endpoint.of(self.endpoint)
+        return end.host, end.port or 0
 
     def __str__(self) -> str:
         return f"{self.node}'s {self.session} session at {self.endpoint}"
@@ -56,13 +55,12 @@ class Address(Struct, frozen=True, kw_only=True):
 
 def addresses(specs: Iterable[NodeSpec]) -> list[Address]:
     """Where these nodes can be dialled, by the fleet file."""
-    found = []
-    for spec in specs:
-        for session, listen in (("control", spec.listen_control), ("data", spec.listen_data)):
-            endpoint = dial_endpoint(listen, spec.host) if listen else ""
-            if endpoint:
-                found.append(Address(node=spec.name, session=session, endpoint=endpoint))
-    return found
+    return [
+        Address(node=spec.name, session=session, endpoint=endpoint)
+        for spec in specs
+        for session, endpoint in (("control", spec.control_at), ("data", spec.data_at))
+        if endpoint
+    ]
 
 
 # --- names -----------------------------------------------------------------------------------------------------------
@@ -70,7 +68,7 @@ def addresses(specs: Iterable[NodeSpec]) -> list[Address]:
 
 def names_resolve(scene: Scene) -> Result:
     """Whether every host of the fleet file has an address here."""
-    hosts = {address.place[0]: address.node for address in addresses(scene.fleet.nodes)}
+    hosts = {host: address.node for address in addresses(scene.fleet.nodes) if (host := address.place[0])}
     if not hosts:
         return skipped("no node of the fleet file has an address")
     pool = ThreadPoolExecutor(max_workers=8)
@@ -119,9 +117,9 @@ def ports_are_ours(scene: Scene) -> Result:
     """Whether nobody but this node's daemon and relay listens on its ports."""
     ports: list[tuple[str, int, str]] = []
     for session, listen in (("control", scene.me.listen_control), ("data", scene.me.listen_data)):
-        host, _, port = listen.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")
-        if port.isdecimal() and int(port) and listen.startswith(("tcp/", "tls/")):
-            ports.append((host.strip("[]"), int(port), session))
+        end = Endpoint.of(listen)
+        if end.port and end.protocol in OVER_TCP:
+            ports.append((end.host, end.port, session))
     if not ports:
         return skipped(f"{scene.node} has no fixed port")
     listening = _listeners()

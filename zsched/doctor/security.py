@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Final
 
 from zsched.clock import wall_ns
-from zsched.config.schema import is_own_host
 from zsched.core.membership.refused import SHOWN_S
 from zsched.core.values.certificates import Role, parse_common_name
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Security
 from zsched.doctor.model import Result, Scene, Verdict, failed, joined, passed, skipped, warned
 from zsched.doctor.state import is_hidden
@@ -205,7 +205,7 @@ def is_not_open_to_everybody(scene: Scene) -> Result:
     if not plain:
         return passed("whoever connects needs a certificate")
     found = [(end, address) for end in plain for address in _addresses(scene, end)]
-    named = [end for end in plain if end not in dict(found) and not is_own_host(end)]
+    named = [end for end in plain if end not in dict(found) and not Endpoint.of(end).is_own_host]
     public = [f"{end} at {address}" for end, address in found if address.is_global]
     fix = "secure the fleet (docs/guide/secure.md)"
     if public:
@@ -221,8 +221,7 @@ def is_not_open_to_everybody(scene: Scene) -> Result:
 
 def _addresses(scene: Scene, endpoint: str) -> Iterator[Address]:
     """The addresses of this machine at which an endpoint takes connections; none of a host name."""
-    host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-    yield from addresses_at(scene.root, host)
+    yield from addresses_at(scene.root, Endpoint.of(endpoint).host)
 
 
 def nobody_is_refused(scene: Scene) -> Result:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.values.fleet import Fleet, LocalSide, NodeSpec, dial_endpoint
+from zsched.core.values.fleet import Fleet, LocalSide, NodeSpec
 from zsched.core.values.model import NodeId
+from zsched.runtime.own_addresses import dialled_here
 from zsched.sessions import config as zenoh_config
 
 Json = dict[str, Any]
@@ -40,9 +41,8 @@ class StreamAccess:
         if node not in names:
             return {"error": f"fleet {self._fleet.name} has no node {node!r}; there are {', '.join(names)}"}
         spec = self._fleet.node(node)
-        dialled = dial_endpoint(spec.listen_data, spec.host) if spec.listen_data else ""
-        is_direct = node == self._me or bool(dialled)
-        connect = self._own if node == self._me or not dialled else (dialled,)
+        is_direct = node == self._me or bool(spec.data_at)
+        connect = self._own if node == self._me or not spec.data_at else (spec.data_at,)
         sides = {"fleet": self._config(connect, self._operator_json5)}
         if node == self._me and spec.local is not None:  # plain text and for this host, whatever the fleet's side is
             sides["local"] = self._config(_ways_to(spec.local), "")
@@ -60,5 +60,4 @@ def joins_at(spec: NodeSpec, own_endpoints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _ways_to(side: LocalSide) -> tuple[str, ...]:
-    listened = (dial_endpoint(endpoint, "127.0.0.1") for endpoint in side.listen)
-    return (*side.connect, *(endpoint for endpoint in listened if endpoint))
+    return (*side.connect, *filter(None, map(dialled_here, side.listen)))

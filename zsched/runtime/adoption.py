@@ -16,6 +16,7 @@ from zsched.adapters.workers.supervisor import WorkerSupervisor
 from zsched.core import events as ev
 from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import watch_for
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct, field
@@ -72,7 +73,9 @@ class Adoption(Struct, kw_only=True):
             AdapterError: a worker's session cannot be written; all adapters stay as they are.
         """
         listen = self.points.data_listen[0]
-        points = endpoints_for(fleet, fleet.node(self.me), lambda: _port(listen), protocol=self.protocol)
+        points = endpoints_for(
+            fleet, fleet.node(self.me), lambda: Endpoint.of(listen).port or 1, protocol=self.protocol
+        )
         connect = (self.points.worker_connect[0], *points.worker_connect[1:])
         self.recipes.adopt(fleet, connect, dials_by_gossip=points.worker_by_gossip)
         _log.info("fleet_file node=%s: adapters follow another one", self.me)
@@ -110,9 +113,3 @@ class Adoption(Struct, kw_only=True):
             if watch != self._watches.get(task):
                 self.relay.watch(watch or WorkerWatch(task=task))
         self._watches = found
-
-
-def _port(endpoint: str) -> int:
-    """The port of the data session, which stays; 1 where it is no number."""
-    port = endpoint.partition("#")[0].partition("?")[0].rpartition(":")[2]
-    return int(port) if port.isdigit() else 1

@@ -10,12 +10,15 @@ import errno
 import secrets
 import socket
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
-from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeId, NodeKind
-from zsched.core.values.struct import Struct, replace
+from zsched.core.values.struct import Struct
+from zsched.runtime.own_addresses import dialled_here
 
 PORT_RANGE: Final = Path("/proc/sys/net/ipv4/ip_local_port_range")
 MIN_PORT: Final = 20_000
@@ -60,18 +63,18 @@ def endpoints_for(
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
     data_listen = me.listen_data or f"{protocol}/0.0.0.0:0"
-    if not dial_endpoint(data_listen, "127.0.0.1"):  # any port will do, but workers must know which
-        address, _, rest = data_listen.rpartition(":")
-        data_listen = f"{address}:{free_port()}{rest.removeprefix('0')}"
+    data = Endpoint.of(data_listen)
+    if data.port == 0:  # any port will do, but workers must know which
+        data_listen = str(data.at(data.host, free_port()))
     return Endpoints(
         control_listen=(me.listen_control or f"{protocol}/0.0.0.0:0",),
         control_connect=_dialled(_targets(fleet, me, _control, is_here), _control),
         data_listen=(data_listen,),
         data_connect=_dialled(_targets(fleet, me, _data), _data),
         worker_connect=(
-            dial_endpoint(data_listen, "127.0.0.1"),
+            dialled_here(data_listen),
             *_dialled(robots, _data),
-            *_dialled([replace(me, host="127.0.0.1")] if me.kind is NodeKind.ROBOT else [], _streams),
+            *([dialled_here(me.listen_streams)] if me.kind is NodeKind.ROBOT and me.listen_streams else []),
             *_dialled(robots, _streams),
         ),
         control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
@@ -80,16 +83,9 @@ def endpoints_for(
     )
 
 
-def _control(node: NodeSpec) -> str:
-    return node.listen_control
-
-
-def _data(node: NodeSpec) -> str:
-    return node.listen_data
-
-
-def _streams(node: NodeSpec) -> str:
-    return node.listen_streams
+_control: Callable[[NodeSpec], str] = attrgetter("control_at")
+_data: Callable[[NodeSpec], str] = attrgetter("data_at")
+_streams: Callable[[NodeSpec], str] = attrgetter("streams_at")
 
 
 def _targets(
@@ -112,8 +108,7 @@ def _hidden(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> list[
 
 
 def _dialled(nodes: list[NodeSpec], endpoint: Callable[[NodeSpec], str]) -> tuple[str, ...]:
-    dialled = (dial_endpoint(endpoint(node), node.host) for node in nodes if endpoint(node))
-    return tuple(target for target in dialled if target)
+    return tuple(endpoint(node) for node in nodes if endpoint(node))
 
 
 def is_here(host: str) -> bool:

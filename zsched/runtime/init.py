@@ -13,7 +13,7 @@ from zsched.adapters.network.fleet_poll import ask_fleet
 from zsched.clock import wall_tenths
 from zsched.core.electorate.recovery import NEW_DISK, Sides, new_member, rejoined
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, dial_endpoint, electorate_hash
+from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import Struct, replace
@@ -154,7 +154,7 @@ def _is_there(folder: Path) -> bool:
 def ask_others(fleet: Fleet, node: NodeId) -> Heard:
     """Ask every other node that has an address for its status."""
     others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
-    endpoints = tuple(filter(None, (dial_endpoint(spec.listen_control, spec.host) for spec in others)))
+    endpoints = tuple(spec.control_at for spec in others if spec.control_at)
     text = session_text(fleet, Side.VISIT)
     protocol_of(fleet, operator_json5(fleet))  # with TLS that cannot work nobody would answer
     configs = [

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zsched.core.values.fleet import Fleet, NodeSpec, dial_endpoint
+from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.model import NodeId
 from zsched.runtime.access_rules import Side, access_control
 from zsched.runtime.endpoints import Endpoints, endpoints_for
@@ -75,11 +75,7 @@ def _dialled(fleet: Fleet, me: NodeId) -> dict[NodeId, set[str]]:
     """{other node: where this one dials it}."""
     points = _points(fleet, me)
     dialled = {*points.control_connect, *points.data_connect}
-    return {
-        node.name: {dial_endpoint(end, node.host) for end in (node.listen_control, node.listen_data) if end} & dialled
-        for node in fleet.nodes
-        if node.name != me
-    }
+    return {node.name: {node.control_at, node.data_at} & dialled for node in fleet.nodes if node.name != me}
 
 
 def _agreed(old: Fleet, new: Fleet) -> Iterator[str]:

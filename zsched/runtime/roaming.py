@@ -16,7 +16,7 @@ import socket
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from zsched.config.schema import is_loopback
+from zsched.core.values.endpoint import is_loopback
 from zsched.core.values.struct import Struct
 
 STAY_S: Final = 2.0

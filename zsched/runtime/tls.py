@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from zsched.config.schema import is_own_host
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
@@ -101,12 +101,12 @@ def exposure(fleet: Fleet, me: NodeSpec, protocol: str, listens: Iterable[str]) 
     plain = [end for end in listens if _scheme(end) not in ENCRYPTED]
     if protocol != PLAIN and not plain:
         return Exposure.ENCRYPTED
-    return Exposure.LOCAL if all(is_own_host(end) for end in plain) else Exposure.OPEN
+    return Exposure.LOCAL if all(Endpoint.of(end).is_own_host for end in plain) else Exposure.OPEN
 
 
 def _open_sides(me: NodeSpec) -> tuple[str, ...]:
     """Where the node's local side listens for other machines, too."""
-    return () if me.local is None else tuple(end for end in me.local.listen if not is_own_host(end))
+    return () if me.local is None else tuple(end for end in me.local.listen if not Endpoint.of(end).is_own_host)
 
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:

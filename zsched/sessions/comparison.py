@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 from typing import Any, Final
 
+from zsched.core.values.endpoint import Endpoint
+
 OTHER_SETTINGS: Final = "new settings"
 
 
@@ -25,7 +27,7 @@ def lacking(read: str, now: str) -> str:
         return OTHER_SETTINGS
     if old != new:
         return OTHER_SETTINGS
-    return ", ".join(one.partition("#")[0] for one in new_ends if one not in old_ends)
+    return ", ".join(Endpoint.of(one).place for one in new_ends if one not in old_ends)
 
 
 def _take_endpoints(session: dict[str, Any]) -> list[str]:

@@ -17,7 +17,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from zsched.core.hop.room import SMALL
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import LocalMode, LocalSide, Timing, WorkerLink
+from zsched.core.values.struct import replace
 
 if TYPE_CHECKING:
     import zenoh
@@ -411,10 +413,10 @@ def _small_buffers(endpoints: tuple[str, ...]) -> tuple[str, ...]:
 
 def _small_buffer(endpoint: str) -> str:
     """The endpoint with our send buffer, unless the operator has set one or the protocol has none."""
-    if not endpoint.startswith(("tcp/", "tls/")) or "so_sndbuf=" in endpoint:
+    end = Endpoint.of(endpoint)
+    if end.protocol not in ("tcp", "tls") or end.option("so_sndbuf"):
         return endpoint
-    separator = ";" if "#" in endpoint else "#"
-    return f"{endpoint}{separator}so_sndbuf={DATA_SEND_BUFFER}"
+    return str(replace(end, options=";".join(filter(None, (end.options, f"so_sndbuf={DATA_SEND_BUFFER}")))))
 
 
 def _render(settings: Settings, operator_json5: str) -> str:

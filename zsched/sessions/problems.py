@@ -14,6 +14,8 @@ import json
 import re
 from typing import Final
 
+from zsched.core.values.endpoint import Endpoint
+
 MAX_WHY: Final = 200
 """Characters of zenoh's own text that go into ours."""
 MAX_NAMED: Final = 4
@@ -68,4 +70,4 @@ def _listens(config: str) -> tuple[str, ...]:
         found = json.loads(config).get("listen", {}).get("endpoints", [])
     except (ValueError, AttributeError):  # an operator's own file may be JSON5: then zenoh's text has to do
         return ()
-    return tuple(str(one).partition("#")[0] for one in found) if isinstance(found, list) else ()
+    return tuple(Endpoint.of(str(one)).place for one in found) if isinstance(found, list) else ()

@@ -12,6 +12,7 @@ from typing import Final
 
 import zenoh
 
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.plan import Role
 from zsched.errors import WireError
 from zsched.guard import guarded, tolerant
@@ -47,7 +48,7 @@ class RoleWatch:
         idle is not told anew when its link is back.
         """
         self._session, self._key, self._on_role, self._stop = session, key, on_role, stop
-        self._relay = relay.partition("#")[0].partition("?")[0]
+        self._relay = Endpoint.of(relay).place if relay else ""
         self._told = threading.Event()
         self._again_s = again_s
         self._token: zenoh.LivelinessToken | None = None
@@ -130,7 +131,7 @@ class RoleWatch:
         Then any answer counts.
         """
         links = self._session.info.links() if self._relay else []
-        return frozenset(str(link.zid) for link in links if link.dst.partition("?")[0] == self._relay)
+        return frozenset(str(link.zid) for link in links if Endpoint.of(str(link.dst)).place == self._relay)
 
     def _hear(self, payload: zenoh.ZBytes) -> None:
         try:

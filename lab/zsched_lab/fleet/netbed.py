@@ -154,7 +154,7 @@ def _received(key: str, number: str, sent_at: str, epoch: str, at: str, node: st
     )
 
 
-def in_namespaces(tree: Json, network: Network, hidden: Collection[NodeId] = ()) -> Json:
+def in_namespaces(tree: Json, network: Network, hidden: Collection[NodeId] = (), options: str = "") -> Json:
     """The fleet file ``tree`` with every node but ``hidden`` at its namespace's address and zsched's usual ports."""
     tree = copy.deepcopy(tree)
     for name, node in tree["nodes"].items():
@@ -163,7 +163,8 @@ def in_namespaces(tree: Json, network: Network, hidden: Collection[NodeId] = ())
             continue
         host = network.address(name)
         node["host"] = host
-        node["listen"] = {"control": f"tcp/0.0.0.0:{CONTROL_PORT}", "data": f"tcp/0.0.0.0:{DATA_PORT}"}
+        ports = {"control": CONTROL_PORT, "data": DATA_PORT}
+        node["listen"] = {kind: f"tcp/0.0.0.0:{port}{options}" for kind, port in ports.items()}
     return tree
 
 
@@ -177,6 +178,7 @@ class Netbed(Testbed):
         tmpfs: {node: size, e.g. ``64k``}: whose state folder is a small file system of its own.
         hidden: nodes whose address the fleet file does not give.
         wrapper: run instead of the daemon's module (a script that takes the same arguments).
+        options: of every listener, such as ``#iface=eth0``.
     """
 
     __test__ = False
@@ -190,13 +192,14 @@ class Netbed(Testbed):
         tmpfs: Mapping[NodeId, str] | None = None,
         wrapper: Path | None = None,
         hidden: Collection[NodeId] = (),
+        options: str = "",
     ) -> None:
         self.network = Network(tree["nodes"]) if network is None else network
         self.tmpfs = dict(tmpfs or {})
         self._daemon: tuple[str | Path, ...] = DAEMON if wrapper is None else (sys.executable, wrapper)
         self._probes: list[Probe] = []
         try:
-            super().__init__(folder, in_namespaces(tree, self.network, hidden))
+            super().__init__(folder, in_namespaces(tree, self.network, hidden, options))
         except BaseException:
             self.network.close()
             raise

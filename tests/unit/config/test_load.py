@@ -22,7 +22,6 @@ from zsched.core.values.fleet import (
     Standby,
     Timing,
     WorkerLink,
-    dial_endpoint,
     electorate_hash,
     fleet_hash,
 )
@@ -521,22 +520,6 @@ def test_hashes_are_the_same_in_another_process(tmp_path: Path) -> None:
     printed = subprocess.run(run, capture_output=True, text=True, check=True, timeout=60).stdout.split()
     fleet = load_fleet(tmp_path / "fleet.yaml")
     assert printed == [fleet_hash(fleet), electorate_hash(fleet)]
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "host", "expected"),
-    [
-        ("tcp/0.0.0.0:7457", "192.0.2.11", "tcp/192.0.2.11:7457"),
-        ("tcp/[::]:7457", "fd00::1", "tcp/[fd00::1]:7457"),
-        ("tcp/127.0.0.1:7457", "", "tcp/127.0.0.1:7457"),
-        ("tls/0.0.0.0:7457#so_sndbuf=65536", "e1.local", "tls/e1.local:7457#so_sndbuf=65536"),
-        ("tcp/0.0.0.0:7457", "", ""),
-        ("tcp/0.0.0.0:0", "h", ""),
-        ("unixsock-stream//run/z.sock", "h", "unixsock-stream//run/z.sock"),
-    ],
-)
-def test_dial_endpoint(endpoint: str, host: str, expected: str) -> None:
-    assert dial_endpoint(endpoint, host) == expected
 
 
 # --- faults ----------------------------------------------------------------------------------------------------------

@@ -1,10 +1,38 @@
-"""What the texts of a fleet file may say: addresses."""
+"""What the texts of a fleet file may say: hosts and endpoints."""
 
 from __future__ import annotations
 
-from zsched.config.schema import is_loopback
+import pytest
+
+from zsched.config.schema import endpoint_fault, host_fault
 
 
-def test_only_an_address_of_this_machine_alone_is_loopback() -> None:
-    hosts = ("127.0.0.1", "127.8.9.1", "::1", "[::1]", "192.0.2.1", "127.example.org", "localhost", "")
-    assert [is_loopback(host) for host in hosts] == [True, True, True, True, False, False, False, False]
+@pytest.mark.parametrize(
+    "text",
+    ["tcp/0.0.0.0:7447#iface=wg0;so_sndbuf=65536", "udp/[::]:1?prio=1-3#iface=wg0", "vsock/-1:1", "unixpipe//run/z"],
+)
+def test_an_endpoint_in_zenoh_s_grammar_is_taken(text: str) -> None:
+    assert endpoint_fault(text) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("tcp/0.0.0.0:7447#", "behind the address"),
+        ("tcp/0.0.0.0:7447?#iface=wg0", "behind the address"),
+        ("tcp/0.0.0.0:7447#iface=wg0?prio=1-3", "behind the address"),
+        ("tcp/[fe80::1]:7447", "of one card"),
+        ("tcp/[fe80::1%eth0]:7447", "of one card"),
+        ("tcp/[2001:db8::1%2]:7447", "of one card"),
+        ("tcp/0.0.0.0:70000", "PORT"),
+        ("tcp/::1:7447", "brackets"),
+        ("TCP/0.0.0.0:7447", "must begin with"),
+    ],
+)
+def test_what_zenoh_would_refuse_or_nobody_else_could_dial_is_a_fault(text: str, words: str) -> None:
+    assert words in (endpoint_fault(text) or "")
+
+
+def test_a_host_with_a_zone_is_of_one_machine() -> None:
+    assert "of one card" in (host_fault("fe80::1%eth0") or "")
+    assert host_fault("169.254.7.1") is None, "an IPv4 one has no zone"

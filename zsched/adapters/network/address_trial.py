@@ -16,12 +16,11 @@ from typing import Final
 
 from zsched.core import events as ev
 from zsched.core.membership.solitude import TAKEN
+from zsched.core.values.endpoint import OVER_TCP, Endpoint
 from zsched.guard import guarded
 
 CONNECT_S: Final = 1.0
 MAX_ADDRESSES: Final = 16
-OVER_TCP: Final = frozenset({"tcp", "tls", "ws"})
-"""Of other protocols only the host is looked up."""
 NO_ROUTE: Final = frozenset({errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN})
 
 
@@ -58,18 +57,17 @@ def _try(address: str, found: dict[str, str]) -> None:
 
 def outcome_of(endpoint: str) -> str:
     """What becomes of one attempt: a few words, empty when nothing can be said; blocks for `CONNECT_S` a connection."""
-    protocol, _, rest = endpoint.partition("/")
-    host, _, port = rest.partition("#")[0].partition("?")[0].rpartition(":")
-    if not host or not port.isdigit():
+    end = Endpoint.of(endpoint)
+    if not end.host or end.port is None:
         return ""
     try:
-        socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        socket.getaddrinfo(end.host, end.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return "name unknown"
-    if protocol not in OVER_TCP:
-        return ""
+    if end.protocol not in OVER_TCP:
+        return ""  # of other protocols only the host is looked up
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S):
+        with socket.create_connection((end.host, end.port), timeout=CONNECT_S):
             return TAKEN
     except TimeoutError:
         return f"no answer in {CONNECT_S:g} s"

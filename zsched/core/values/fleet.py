@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import Any
 
 from zsched.core.values.document import Rollout
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
@@ -141,6 +142,26 @@ class NodeSpec(Struct, frozen=True, kw_only=True):
     links: tuple[LinkSpec, ...] = ()
     local: LocalSide | None = None
     """``None``: the host's applications are on the fleet's data network."""
+
+    @property
+    def control_at(self) -> str:
+        """Where others dial its control session; empty: they cannot."""
+        return Endpoint.of(self.listen_control).dialled(self.host)
+
+    @property
+    def data_at(self) -> str:
+        """Where others dial its data session."""
+        return Endpoint.of(self.listen_data).dialled(self.host)
+
+    @property
+    def streams_at(self) -> str:
+        """Where workers dial an application of its that has its streams itself."""
+        return Endpoint.of(self.listen_streams).dialled(self.host)
+
+    @property
+    def can_be_dialled(self) -> bool:
+        """Control and data are meshes of their own: whether it can be a seed of both."""
+        return bool(self.control_at and self.data_at)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -484,25 +505,6 @@ class Fleet:
             if task.name == name:
                 return task
         raise KeyError(name)
-
-
-def dial_endpoint(endpoint: str, host: str) -> str:
-    """The zenoh endpoint under which others reach a node that listens on ``endpoint``; empty when they cannot.
-
-    A listener on every address (``0.0.0.0``, ``[::]``) is dialled at ``host``; port 0 (any) cannot be dialled.
-
-    >>> dial_endpoint("tcp/0.0.0.0:7457", "192.0.2.11")
-    'tcp/192.0.2.11:7457'
-    """
-    protocol, _, address = endpoint.partition("/")
-    for everywhere in ("0.0.0.0:", "[::]:"):
-        if address.startswith(everywhere):
-            literal = f"[{host}]" if ":" in host else host
-            address = f"{literal}:{address.removeprefix(everywhere)}" if host else ""
-    port = address.partition("#")[0].partition("?")[0].rpartition(":")[2]
-    if not address or port == "0":
-        return ""
-    return f"{protocol}/{address}"
 
 
 @lru_cache(maxsize=8)

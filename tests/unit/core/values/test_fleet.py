@@ -21,7 +21,6 @@ from zsched.core.values.fleet import (
     Timing,
     WorkerSpec,
     default_patience,
-    dial_endpoint,
     electorate_hash,
     fleet_hash,
 )
@@ -83,22 +82,6 @@ def test_node_and_task_are_found_by_name_or_raise() -> None:
 def test_impossible_demand_is_refused(cpu: float, memory: float) -> None:
     with pytest.raises(ValueError, match=r"^demand\."):
         Demand(cpu_cores=cpu, memory_mb=memory)
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "host", "dialled"),
-    [
-        ("tcp/0.0.0.0:7457", "192.0.2.11", "tcp/192.0.2.11:7457"),
-        ("tcp/[::]:7457", "2001:db8::1", "tcp/[2001:db8::1]:7457"),
-        ("tcp/[::]:7457", "edge1.local", "tcp/edge1.local:7457"),
-        ("tcp/127.0.0.1:27450", "192.0.2.11", "tcp/127.0.0.1:27450"),
-        ("tcp/0.0.0.0:7457", "", ""),
-        ("tcp/127.0.0.1:0", "192.0.2.11", ""),
-        ("", "192.0.2.11", ""),
-    ],
-)
-def test_endpoint_that_others_dial(endpoint: str, host: str, dialled: str) -> None:
-    assert dial_endpoint(endpoint, host) == dialled
 
 
 def _other_weights() -> Fleet:
