@@ -96,9 +96,7 @@ class Round:
 def _worker(*, is_owner: bool) -> WorkerLoad:
     if not is_owner:
         return WorkerLoad(task="task", state=WorkerState.READY, cpu_cores=0.0, memory_mb=60.0)
-    return WorkerLoad(
-        task="task", state=WorkerState.READY, cpu_cores=0.4, memory_mb=240.0, runnable=0.4, jobs=JOBS, spent_s=40.0
-    )
+    return WorkerLoad(task="task", state=WorkerState.READY, cpu_cores=0.4, memory_mb=240.0, runnable=0.4, jobs=JOBS)
 
 
 def milliseconds(action: Callable[[], object], repeat: int) -> float:

@@ -48,9 +48,8 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     worth = "the share of its work that it gets done there" if is_service else "what is left free there (Eq. 1 and 2)"
     yield f"a machine is worth {worth} (score: {tuning.score})"
     yield from _weighed(tuning)
-    if tuning.deadline_ms is not None:
-        word = _WORD if tells_jobs(spec.worker) else _TIMED
-        yield LATENCY.format(deadline=f"{tuning.deadline_ms:g}", word=word)
+    if tuning.deadline_ms is not None and tells_jobs(spec.worker):
+        yield LATENCY.format(deadline=f"{tuning.deadline_ms:g}")
     elif is_service:
         yield "it wants as many of its jobs done as possible, late ones too (objective: service)"
     floor = f"{100 * spec.memory_floor_ratio:g} %"
@@ -167,11 +166,9 @@ ON_TOP = (
     "that is smoothing and patience alone: sampling, gathering, the vote and the commit come on top (with the "
     "defaults 0.7 to 3.0 s were seen from a real load to the move)"
 )
-_WORD = "its worker's word of its jobs"
-_TIMED = "the times of its worker's answers, as the robots see them"
 LATENCY = (
     "objective latency: of the work that it gets done there the share counts that is expected within {deadline} ms "
-    "(deadline_ms), by {word} (CPU per job over the machine's speed and what is free there, or "
+    "(deadline_ms), by its worker's word of its jobs (CPU per job over the machine's speed and what is free there, or "
     "its fair share if that is more; its usual queue, and what a job waits for otherwise; what it got there before) "
     "and the measured way there and back; late work counts a tenth"
 )

@@ -281,7 +281,7 @@ def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Co
         out.warn(
             scheduling.where("objective"),
             TELLS_NOTHING,
-            "put the input's timestamp on each answer (docs/guide/worker.md), or use zsched.worker (ready: token)",
+            "use zsched.worker (ready: token), or delete objective and deadline_ms",
         )
 
 

@@ -17,7 +17,7 @@ from typing import Any, Final
 from zsched.core import instructions as do
 from zsched.core.electorate.numbers import known_at_start
 from zsched.core.events import SlotReady
-from zsched.core.executor.handover import Executor, Phase
+from zsched.core.executor.handover import Executor
 from zsched.core.executor.progress import HangWatch
 from zsched.core.executor.renewing import Renewing
 from zsched.core.executor.rollouts import Rollouts
@@ -36,7 +36,6 @@ from zsched.core.membership.peers import Membership
 from zsched.core.membership.refused import RefusedKeys
 from zsched.core.membership.relink import Introductions, MuteLinks
 from zsched.core.membership.solitude import Solitude
-from zsched.core.profile.answers import Answers
 from zsched.core.profile.profile import Profiler
 from zsched.core.profile.relay_ends import RelayEnds
 from zsched.core.recent import RecentWorst
@@ -49,7 +48,6 @@ from zsched.core.scheduler.rounds import Rounds
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.scheduler.unseen import Unseen
 from zsched.core.todo import ToDo
-from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
@@ -166,7 +164,6 @@ class Stages:
         # PROFILE, GATEWAY
         self.profiler = Profiler(me, incarnation, fleet.timing)
         self.relay_ends = RelayEnds()
-        self.answers = Answers()
         self.gateway = Gateway(fleet)
         self.round_trips = RoundTrips(me)
         # SCHEDULER, VOTE
@@ -252,28 +249,6 @@ class Stages:
     def has_deadlines(self) -> bool:
         """Whether the way to other nodes counts in any score: by the agreed tunings, for operators change them."""
         return any(value.tuning.deadline_ms is not None for value in self.values().values())
-
-    def timed(self) -> Mapping[TaskId, NodeId]:
-        """{task: owner} of the tasks with a deadline whose worker tells nothing of its jobs, where streams flow to it.
-
-        During a handover, and while this robot works alone, no answer tells of the owner.
-        """
-        found = {}
-        for task in self._timed():
-            executor = self.executors[task]
-            is_steady = executor.has_streams and executor.phase is Phase.SETTLED and not executor.is_local
-            if executor.owner is not None and is_steady:
-                found[task] = executor.owner
-        return found
-
-    def timed_here(self) -> tuple[TaskId, ...]:
-        """Those of them that this node owns, in any phase."""
-        return tuple(task for task in self._timed() if self.executors[task].owner == self.me)
-
-    def _timed(self) -> tuple[TaskId, ...]:
-        silent = [spec.name for spec in self.fleet.tasks if not tells_jobs(spec.worker)]
-        values = self.values() if silent else {}  # most fleets have none, and every sample asks
-        return tuple(task for task in silent if values[task].tuning.deadline_ms is not None)
 
     def owned(self) -> tuple[TaskId, ...]:
         """The tasks that this node owns, as far as it has learnt."""

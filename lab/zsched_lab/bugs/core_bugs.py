@@ -1152,13 +1152,6 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_job_need.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
-        "all of an answer's wait is taken for a queue",
-        "zsched.core.gateway.job_need",
-        "queue_s = min(waits_s, LIKELY_QUEUEING * crowded_s)",
-        "queue_s = waits_s",
-        ("tests/unit/core/gateway/test_job_need.py", "tests/unit/core/test_closed_loop.py"),
-    ),
-    _bug(
         "others that waited only beside a task are forgotten when it leaves",
         "zsched.core.gateway.sharing",
         "return seen if self.left_at is None else max(seen, min(seen + self.more, self.beside))",
@@ -1248,34 +1241,6 @@ VOTE_BUGS = (
         "if all(player.owner is not None and best - aggregates[player.owner] <= bonus for player in self._players):",
         "if best >= 0.0:",
         ("tests/unit/core/scheduler/test_patience.py",),
-    ),
-    _bug(
-        "answers are compared with what was spent since they were counted",
-        "zsched.core.gateway.spending",
-        "if not risen or not (self._clock is None or self._clock in risen or is_silent):",
-        "if not counts:",
-        ("tests/unit/core/gateway/test_spending.py",),
-    ),
-    _bug(
-        "the wait for a full machine's CPU follows a foreign worker to the next one",
-        "zsched.core.gateway.job_need",
-        "        if is_calm:",
-        "        if speed > 0.0:",
-        ("tests/unit/core/gateway/test_job_need.py",),
-    ),
-    _bug(
-        "a robot that repeats itself counts each time",
-        "zsched.core.gateway.job_need",
-        "told.setdefault(profile.node, one)",
-        'told[f"{profile.node}{len(told)}"] = one',
-        ("tests/unit/core/gateway/test_job_need.py",),
-    ),
-    _bug(
-        "a robot's way counts twice in the time of an answer",
-        "zsched.core.profile.answers",
-        "round_trips.get(owner, 0.0)",
-        "round_trips.get(task, 0.0)",
-        ("tests/unit/core/profile/test_answers.py",),
     ),
     _bug(
         "median and mean swapped",
@@ -1535,8 +1500,8 @@ VOTE_BUGS = (
     _bug(
         "a machine is slower for a task whose jobs differ",
         "zsched.core.gateway.demand",
-        "least_s = min(job_cpu_s, found.job_least_s or job_cpu_s)",
-        "least_s = job_cpu_s",
+        "least_s = min(jobs.cpu_s, found.job_least_s or jobs.cpu_s)",
+        "least_s = jobs.cpu_s",
         ("tests/unit/core/gateway/test_task_speed.py",),
     ),
     _bug(

@@ -75,11 +75,11 @@ def test_a_floor_is_told_only_where_what_it_is_of_is_weighed() -> None:
     assert "(cpu_floor_ratio: 0)" not in memory
 
 
-def test_the_times_of_a_deadline_are_told_by_who_measures_them() -> None:
+def test_a_deadline_is_told_where_the_worker_tells_of_its_jobs() -> None:
     timed = replace(SPEC, tuning=replace(RADIO, deadline_ms=80.0))
     assert "by its worker's word of its jobs (CPU per job" in words(timed)
     foreign = replace(timed, worker=replace(timed.worker, ready_when=ReadyWhen.MATCHING))
-    assert "by the times of its worker's answers, as the robots see them (CPU per job" in words(foreign)
+    assert "(objective: service)" in words(foreign)
 
 
 def test_a_task_that_does_not_weigh_the_network_is_told_of_its_reach_alone() -> None:

@@ -22,7 +22,6 @@ from support.profiles import load_of
 from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.profile.answers import Answers
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide
@@ -35,10 +34,8 @@ from zsched.core.values.fleet import (
     PAPER_PATIENCE,
     Demand,
     Timing,
-    WorkerSpec,
 )
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
-from zsched.core.values.plan import ReadyWhen, StreamCount
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
 from zsched.core.vote.tally import VoteOutcome, tally
 
@@ -75,12 +72,8 @@ class Machine:
     shows_worker: bool = True
     job_s: float | None = None
     """Its worker tells of its jobs, of so many CPU seconds at speed 1; ``None``: it does not."""
-    is_foreign: bool = False
-    """Its worker tells nothing: robots see how long its answers take."""
     waits_s: float = 0.0
     """Of such an answer, for other things than a CPU."""
-    in_bursts: bool = False
-    """It works on one whole job after the other, on one core, and rests in between."""
     queueing: float = 0.0
     """Its jobs come irregularly: they wait so many times u / (1 - u) of their time for each other, u being busy."""
     rub: float = 1.0
@@ -126,10 +119,6 @@ class Machine:
             runnable=runnable if self.shows_worker else None,
         )
         self._work(now, needs, takes, runnable)
-        if self.in_bursts:
-            takes = self._burst(takes, min(room, self.most_cores, 1.0))
-            runnable = runnable if is_short else takes
-            load = replace(load, cpu_cores=takes, runnable=runnable)
         device = DeviceSample(
             cpu_cores=self.cores,
             cpu_used_cores=min(rest + takes, self.cores),
@@ -143,10 +132,7 @@ class Machine:
 
     def __post_init__(self) -> None:
         self.told: WorkerJobs | None = None
-        self.answers: tuple[float, float] | None = None
-        """(seconds of an answer, answers per second) of a foreign worker."""
         self._done = self._undone = self._now = 0.0
-        self._owed_s, self._is_at_work = 0.0, False
 
     def _in_turns(self, needs: float, free_cores: float, now: float) -> tuple[float, float]:
         """(cores in use, threads that run or wait): while it has a job its thread runs at a fair share."""
@@ -157,21 +143,6 @@ class Machine:
         cpu_s = self.size(now) * self.job_s / self._speed * rubs
         takes = min(needs * rubs, cpu_s / (self.waits_s + cpu_s / rate))
         return takes, takes / rate
-
-    def _burst(self, mean_cores: float, most_cores: float) -> float:
-        """Cores in use by a worker that does whole jobs, by ``most_cores`` each, and uses so much on the mean."""
-        assert self.job_s is not None
-        period_s = Timing().sample_s
-        self._owed_s += period_s * mean_cores
-        self._is_at_work = self._owed_s >= (period_s if self._is_at_work else self.job_s / self._speed)
-        spent_s = min(period_s * most_cores, self._owed_s) if self._is_at_work else 0.0
-        self._owed_s -= spent_s
-        return spent_s / period_s
-
-    @property
-    def finished(self) -> int:
-        """Jobs that it has done."""
-        return int(self._done)
 
     @property
     def _speed(self) -> float:
@@ -201,10 +172,6 @@ class Machine:
             time_s = runnable / done_hz
         busy = min(needs, 0.9)
         queue_s = time_s * self.queueing * busy / (1.0 - busy)
-        self.answers = (self.waits_s + time_s + queue_s, done_hz)
-        if self.is_foreign:
-            self.told = None
-            return
         self.told = replace(
             word,
             at_s=now,
@@ -242,20 +209,15 @@ class Loop:
             demand=self.demand,
             patience=self.patience,
             learns_patience=self.learns,
-            worker=WorkerSpec(
-                command=("worker",), ready_when=ReadyWhen.MATCHING if self.machines[0].is_foreign else ReadyWhen.TOKEN
-            ),
         )
         fleet = fleet_of(self.spec, of=(*names, *self.robots), timing=self.timing)
         self.allocation = allocation_of(owner=names[0], tuning=self.spec.tuning)
         self.gateways = {robot: Gateway(fleet) for robot in self.robots}
         self.judges = {robot: Judge(spec=self.spec) for robot in self.robots}
         self.profilers = {name: Profiler(name, 1, self.timing) for name in (*names, *self.robots)}
-        self.answers = {robot: Answers() for robot in self.robots}
         self.states = dict.fromkeys(self.profilers, PeerState.ALIVE)
         self.rng = Random(self.seed)
         self.settled_at = 0.0
-        self.counts = self.counted = 0
 
     def run(self, until_s: float) -> list[tuple[float, str]]:
         """(when, where to) of every move."""
@@ -272,34 +234,19 @@ class Loop:
         for machine in self.machines:
             is_owner = machine.name == self.allocation.owner
             device, link = machine.sample(now, self.rng, is_owner=is_owner)
-            self.profilers[machine.name].watch_use(("merge",) if is_owner and machine.is_foreign else ())
             if machine.told is not None:
                 self.profilers[machine.name].note_jobs(machine.told, now)
             self.profilers[machine.name].absorb(device, (link,) if self.weights.network > 0.0 else (), now)
-        if self.weights.network > 0.0 or self.machines[0].is_foreign:
+        if self.weights.network > 0.0:
             device = DeviceSample(cpu_cores=4.0, cpu_used_cores=1.0, memory_mb=MEMORY_MB, memory_used_mb=1000.0)
             link = LinkSample(source=LinkSource.NL80211, rssi_dbm=-45.0)
             for robot in self.robots:
                 self.profilers[robot].absorb(device, (link,), now)
-        if self.machines[0].is_foreign and now >= self.counts:
-            self.counts += 1
-            self._count_answers(now)
-        for name, profiler in self.profilers.items():
-            answers = self.answers[name].told(now) if name in self.answers else ()
-            profile = profiler.publishable(READY, is_draining=False, now=now, answers=answers)
+        for profiler in self.profilers.values():
+            profile = profiler.publishable(READY, is_draining=False, now=now)
             if profile is not None:
                 for gateway in self.gateways.values():
                     assert gateway.absorb(profile, now) is None
-
-    def _count_answers(self, now: float) -> None:
-        """What the robots' relays count of the owner's answers, once a second; the robots ask in turn."""
-        owner = next(machine for machine in self.machines if machine.name == self.allocation.owner)
-        age_s = None if owner.answers is None else owner.answers[0]
-        for turn, answers in enumerate(self.answers.values()):
-            had, has = ((done + turn) // len(self.robots) for done in (self.counted, owner.finished))
-            count = StreamCount(stream="merge/out/0", answer_s=age_s, paired_hz=float(has - had) if has > had else None)
-            answers.absorb({"merge": owner.name}, (count,), {}, now)
-        self.counted = owner.finished
 
     def _round(self, now: float) -> None:
         judgements = self._judge(now, is_called=False)
@@ -724,129 +671,19 @@ def test_a_task_with_a_deadline_goes_where_its_jobs_are_quicker_though_it_loses_
     assert where == "edge2"
 
 
-FOREIGN = (
-    Machine(name="edge1", base=0.1, task_cores=0.3, job_s=0.1, is_foreign=True),
-    Machine(name="edge2", base=0.1, speed=2.0, task_cores=0.3, job_s=0.1, is_foreign=True),
-)
-
-
-@pytest.mark.parametrize("robots", [("robot1",), ("robot1", "robot2", "robot3")])
-def test_so_does_a_task_whose_worker_tells_nothing_and_whose_robots_see_its_answers(robots: tuple[str, ...]) -> None:
-    by_latency = replace(BY_SERVICE, deadline_ms=100.0)
-    assert Loop(FOREIGN, weights=CPU_ONLY, tuning=BY_SERVICE, learns=True, robots=robots).run(60.0) == []
-    ((_, where),) = Loop(FOREIGN, weights=CPU_ONLY, tuning=by_latency, learns=True, robots=robots).run(60.0)
-    assert where == "edge2"
-
-
-def test_a_foreign_worker_that_waits_for_other_things_is_as_late_on_a_faster_machine() -> None:
-    machines = tuple(replace(one, job_s=0.005, waits_s=0.15) for one in FOREIGN)
-    by_latency = replace(BY_SERVICE, deadline_ms=100.0)
-    assert Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(60.0) == []
-
-
-@pytest.mark.parametrize("hz", [1.0, 2.0, 3.0])
-def test_a_foreign_worker_of_few_large_jobs_stays_where_all_machines_are_alike(hz: float) -> None:
-    """Its use swings between nothing and a core: no moment of it tells what a job takes, or how fast a machine is."""
-    machines = tuple(
-        Machine(name=f"edge{n}", base=0.1, task_cores=0.15 * hz, job_s=0.15, is_foreign=True, in_bursts=True)
-        for n in (1, 2, 3)
-    )
-    by_latency = replace(BY_SERVICE, deadline_ms=160.0)
-    loop = Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True)
-    assert loop.run(300.0) == []
-    job = loop.gateways["robot1"].demands.job("merge")
-    assert job is not None
-    assert job.work_s == pytest.approx(0.15, rel=0.1)
-
-
-def test_a_foreign_worker_s_late_answers_on_a_full_machine_are_fled_and_it_does_not_come_back() -> None:
-    """It gets all the CPU that it needs on the mean, and each of its jobs three times as late: by service it stays."""
-    full = Machine(name="edge1", base=0.1, step=lambda now: 0.85 if now >= 20.0 else 0.0, threads=4.0, is_foreign=True)
-    machines = tuple(
-        replace(one, task_cores=0.4, job_s=0.1) for one in (full, Machine(name="edge2", base=0.2, is_foreign=True))
-    )
-    late = replace(BY_SERVICE, deadline_ms=200.0)
-    ((at, where),) = Loop(machines, weights=CPU_ONLY, tuning=late, learns=True).run(200.0)
-    assert where == "edge2"
-    assert 20.0 < at < 30.0
-
-
-QUICK_AND_FULL = (
-    Machine(name="edge1", cores=1.0, base=0.96, speed=1.18, threads=0.5, task_cores=0.012, task_mb=800.0),
-    Machine(name="edge2", base=0.09, speed=0.74, threads=8.5, task_cores=0.012, task_mb=100.0),
-)
-LARGE = tuple(
-    Machine(
-        name=name,
-        cores=cores,
-        base=0.0,
-        memory=memory,
-        noise=0.02,
-        speed=speed,
-        own_speed=own,
-        threads=4.0,
-        task_cores=2.19,
-        task_mb=300.0,
-    )
-    for name, cores, memory, speed, own in (("edge1", 11.07, 0.9, 0.58, 1.1), ("edge2", 1.67, 0.21, 1.34, 0.77))
-)
-FEW_THREADS = (
-    Machine(name="edge1", base=0.09, speed=0.49, threads=18.0, task_cores=6.18, task_mb=100.0),
-    Machine(name="edge2", cores=2.0, base=0.81, speed=2.33, threads=18.0, task_cores=6.18, task_mb=800.0),
-)
-"""13 of the task's threads want to run on the slow machine, and 3 on the other one."""
-ONE, THREE = ("robot1",), ("robot1", "robot2", "robot3")
-
-
-@settings(derandomize=True, database=None, deadline=None, max_examples=12)
-@example(machines=QUICK_AND_FULL, weights=CPU_ONLY, job_s=0.136, waits_s=0.0, deadline_ms=150.0, whole=True, robots=ONE)
-@example(machines=FEW_THREADS, weights=CPU_ONLY, job_s=0.37, waits_s=0.0, deadline_ms=1000.0, whole=False, robots=ONE)
-@example(machines=LARGE, weights=BOTH, job_s=0.27, waits_s=0.0, deadline_ms=1000.0, whole=False, robots=THREE)
-@given(
-    machines=st.one_of(tempting_machines(), constant_machines()),
-    weights=st.sampled_from((BOTH, WITH_NETWORK, CPU_ONLY)),
-    job_s=st.floats(0.02, 0.6),
-    waits_s=st.sampled_from((0.0, 0.05)),
-    deadline_ms=st.sampled_from((150.0, 1000.0)),
-    whole=st.booleans(),
-    robots=st.sampled_from((ONE, THREE)),
-)
-def test_where_nothing_changes_a_task_whose_answers_are_timed_comes_to_rest(
-    machines: tuple[Machine, ...],
-    weights: Weights,
-    job_s: float,
-    waits_s: float,
-    deadline_ms: float,
-    whole: bool,
-    robots: tuple[str, ...],
-) -> None:
-    """Whether its worker does a little all the time or ``whole`` jobs now and then."""
-    for machine in machines:
-        machine.is_foreign, machine.job_s, machine.waits_s = True, job_s, waits_s
-        machine.in_bursts = whole and machine.task_cores <= 1.0
-    tuning = replace(BY_SERVICE, deadline_ms=deadline_ms)
-    moves = Loop(machines, weights=weights, tuning=tuning, learns=True, robots=robots).run(600.0)
-    assert len([at for at, _ in moves if at <= 300.0]) <= 4
-    assert [at for at, _ in moves if at > 300.0] == []
-
-
-@pytest.mark.parametrize("is_foreign", [False, True])
 @pytest.mark.parametrize(("base", "deadline_ms"), [(0.7, 150.0), (0.7, 300.0), (0.9, 150.0)])
 def test_a_task_with_a_deadline_stays_where_machines_are_alike_and_somebody_else_works_on_each(
-    is_foreign: bool, base: float, deadline_ms: float
+    base: float, deadline_ms: float
 ) -> None:
     """It has a fair share on both; its own thread on its owner takes nothing from it."""
     machines = tuple(
         Machine(name=name, cores=1.0, base=base, memory=0.2, threads=1.0, task_cores=0.28, job_s=0.1)
         for name in ("edge1", "edge2")
     )
-    for machine in machines:
-        machine.is_foreign = is_foreign
     by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
     assert Loop(machines, weights=CPU_ONLY, tuning=by_latency, learns=True).run(120.0) == []
 
 
-@pytest.mark.parametrize("is_foreign", [False, True])
 @pytest.mark.parametrize(
     ("cores", "base", "threads", "task_cores", "job_s", "waits_s", "deadline_ms"),
     [
@@ -859,7 +696,6 @@ def test_a_task_with_a_deadline_stays_where_machines_are_alike_and_somebody_else
     ],
 )
 def test_a_task_that_waits_for_its_turn_comes_to_rest_where_machines_are_alike(
-    is_foreign: bool,
     cores: float,
     base: float,
     threads: float,
@@ -872,7 +708,7 @@ def test_a_task_that_waits_for_its_turn_comes_to_rest_where_machines_are_alike(
     machine = Machine(
         name="edge1", cores=cores, base=base, memory=0.2, threads=threads, task_cores=task_cores, takes_turns=True
     )
-    machine = replace(machine, job_s=job_s, waits_s=waits_s, is_foreign=is_foreign)
+    machine = replace(machine, job_s=job_s, waits_s=waits_s)
     by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
     loop = Loop((machine, replace(machine, name="edge2")), weights=CPU_ONLY, tuning=by_latency, learns=True)
     moves = loop.run(150.0)
@@ -880,15 +716,14 @@ def test_a_task_that_waits_for_its_turn_comes_to_rest_where_machines_are_alike(
     assert [at for at, _ in moves if at > 30.0] == []
 
 
-@pytest.mark.parametrize("is_foreign", [False, True])
 @pytest.mark.parametrize("task_cores", [0.15, 0.3])
 @pytest.mark.parametrize("deadline_ms", [150.0, 250.0])
 def test_jobs_that_a_load_held_up_are_no_reason_to_leave_when_it_has_ended(
-    is_foreign: bool, task_cores: float, deadline_ms: float
+    task_cores: float, deadline_ms: float
 ) -> None:
     """They count in the mean for some seconds; the other machine is free at the same moment, and as quick."""
     machine = Machine(name="edge1", cores=1.0, base=1.0, memory=0.2, threads=8.0, frees_at=30.0, takes_turns=True)
-    machine = replace(machine, task_cores=task_cores, job_s=0.1, is_foreign=is_foreign)
+    machine = replace(machine, task_cores=task_cores, job_s=0.1)
     by_latency = replace(BY_SERVICE, deadline_ms=deadline_ms)
     loop = Loop((machine, replace(machine, name="edge2")), weights=CPU_ONLY, tuning=by_latency, learns=True)
     assert loop.run(60.0) == []
@@ -921,24 +756,23 @@ QUEUES = Machine(name="edge1", base=0.1, signal_dbm=-45.0, task_cores=0.5, job_s
 
 
 @settings(derandomize=True, database=None, deadline=None, max_examples=8)
-@example(far_dbm=-55.0, speed=2.0, queueing=1.0, deadline_ms=150.0, is_foreign=False)
-@example(far_dbm=-60.0, speed=2.0, queueing=2.0, deadline_ms=150.0, is_foreign=False)
-@example(far_dbm=-60.0, speed=2.0, queueing=1.0, deadline_ms=100.0, is_foreign=True)
+@example(far_dbm=-55.0, speed=2.0, queueing=1.0, deadline_ms=150.0)
+@example(far_dbm=-60.0, speed=2.0, queueing=2.0, deadline_ms=150.0)
+@example(far_dbm=-60.0, speed=2.0, queueing=1.0, deadline_ms=100.0)
 @given(
     far_dbm=st.floats(-70.0, -45.0),
     speed=st.floats(1.0, 4.0),
     queueing=st.floats(0.2, 3.0),
     deadline_ms=st.floats(60.0, 300.0),
-    is_foreign=st.booleans(),
 )
 def test_a_task_whose_jobs_wait_for_each_other_comes_to_rest(
-    far_dbm: float, speed: float, queueing: float, deadline_ms: float, is_foreign: bool
+    far_dbm: float, speed: float, queueing: float, deadline_ms: float
 ) -> None:
     """A quick machine far away keeps the deadline, and by its short queue the slow one nearby would keep it as well.
 
     By the owner's queue alone the examples are limit cycles of 19 to 38 moves (docs/decisions/0123).
     """
-    near = replace(QUEUES, queueing=queueing, is_foreign=is_foreign)
+    near = replace(QUEUES, queueing=queueing)
     far = replace(near, name="edge2", speed=speed, signal_dbm=far_dbm)
     tuning = replace(BY_SERVICE, deadline_ms=deadline_ms)
     moves = Loop((near, far), weights=WITH_NETWORK, tuning=tuning, learns=True).run(400.0)
@@ -946,11 +780,8 @@ def test_a_task_whose_jobs_wait_for_each_other_comes_to_rest(
     assert [at for at, _ in moves if at > 200.0] == []
 
 
-@pytest.mark.parametrize("is_foreign", [False, True])
-def test_a_machine_that_was_too_slow_for_its_queue_has_the_task_again_when_jobs_come_less_often(
-    is_foreign: bool,
-) -> None:
-    near = replace(QUEUES, is_foreign=is_foreign, fewer_from=60.0)
+def test_a_machine_that_was_too_slow_for_its_queue_has_the_task_again_when_jobs_come_less_often() -> None:
+    near = replace(QUEUES, fewer_from=60.0)
     far = replace(near, name="edge2", speed=2.0, signal_dbm=-60.0)
     loop = Loop((near, far), weights=WITH_NETWORK, tuning=replace(BY_SERVICE, deadline_ms=100.0), learns=True)
     moves = loop.run(400.0)

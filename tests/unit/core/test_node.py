@@ -19,7 +19,7 @@ from support.states import state_of
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.strangers import SHOWN_S
-from zsched.core.executor.handover import HEARS_S, Phase
+from zsched.core.executor.handover import HEARS_S
 from zsched.core.executor.sparing import Sparing
 from zsched.core.handlers.work import carry_out
 from zsched.core.membership.identity import QUIET_S
@@ -52,7 +52,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
-from zsched.core.values.profile import AnswerTime, Echo, WorkerState
+from zsched.core.values.profile import Echo, WorkerState
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
@@ -1306,67 +1306,6 @@ def test_a_document_that_was_not_valid_beside_this_machines_file_is_tried_again_
     refused["0d"] = "it has no section `security:`, and the file here has one"
     node.handle(ev.FleetChanged(fleet=FLEET), 101.0)
     assert refused == {}
-
-
-TIMED = (StreamCount(stream="merge/out/0", answer_s=0.2, paired_hz=5.0),)
-
-
-def timed(me: str = "robot1", *, ready_when: ReadyWhen = ReadyWhen.MATCHING, deadline_ms: float | None = 100.0) -> Node:
-    """A node; edge1's worker has served its streams for a while, if it has any."""
-    node = started(me)
-    worker = WorkerSpec(command=("merge",), ready_when=ready_when)
-    file = replace(FLEET, tasks=(replace(FLEET.tasks[0], worker=worker),))
-    node.handle(ev.FleetChanged(fleet=file), 100.5)
-    value = allocation_of(1, "edge1", tuning=tuning_of(deadline_ms=deadline_ms))
-    node.handle(learnt_from("robot2", value), 101.0)
-    for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
-        node.handle(event, 102.0)
-    assert me != "robot1" or node.executors["merge"].phase is Phase.SETTLED
-    return node
-
-
-def told_of_answers(node: Node, now: float) -> tuple[AnswerTime, ...]:
-    for at in (now, now + 1.0):  # the first count may still tell of an owner before
-        node.handle(ev.StreamsCounted(counts=TIMED), at)
-    node.handle(ev.ProfileSampled(device=SAMPLE), now + 1.0)
-    (profile,) = [one.profile for one in of(node.handle(ev.DeadlineReached(), now + 5.0), do.PublishProfile)]
-    return profile.answers
-
-
-def test_a_robot_times_the_answers_of_a_worker_that_tells_nothing_where_a_deadline_needs_it() -> None:
-    assert told_of_answers(timed(), 103.0) == (AnswerTime(task="merge", owner="edge1", age_s=0.2, count=5.0),)
-    assert told_of_answers(timed(deadline_ms=None), 103.0) == ()
-    assert told_of_answers(timed(ready_when=ReadyWhen.TOKEN), 103.0) == ()
-
-
-@pytest.mark.parametrize(
-    ("me", "ready_when", "deadline_ms", "is_told"),
-    [
-        ("edge1", ReadyWhen.MATCHING, 100.0, True),
-        ("edge1", ReadyWhen.MATCHING, None, False),
-        ("edge1", ReadyWhen.TOKEN, 100.0, False),
-        ("edge2", ReadyWhen.MATCHING, 100.0, False),
-    ],
-)
-def test_its_owner_tells_what_its_worker_has_spent(
-    me: str, ready_when: ReadyWhen, deadline_ms: float | None, *, is_told: bool
-) -> None:
-    node = timed(me, ready_when=ready_when, deadline_ms=deadline_ms)
-    node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), 102.0)
-    sample = replace(SAMPLE, workers=(load_of(cpu_cores=0.5),))
-    for step in range(40):
-        node.handle(ev.ProfileSampled(device=sample), 103.0 + 0.2 * step)
-    (profile,) = [one.profile for one in of(node.handle(ev.DeadlineReached(), 113.0), do.PublishProfile)]
-    load = profile.worker("merge")
-    assert load is not None
-    assert load.spent_s == (pytest.approx(0.5 * 0.2 * 39 + 0.5 * 3.0, abs=0.11) if is_told else None)
-
-
-def test_during_a_handover_no_answer_tells_of_the_owner() -> None:
-    node = timed()
-    value = allocation_of(2, "edge2", 2, tuning=tuning_of(deadline_ms=100.0))
-    node.handle(learnt_from("robot2", value), 102.5)
-    assert told_of_answers(node, 103.0) == ()
 
 
 @pytest.mark.parametrize(("epoch", "waits"), [(1, False), (2, True)])

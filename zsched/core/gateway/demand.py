@@ -16,9 +16,8 @@ from collections.abc import Container
 from typing import Final, Self
 
 from zsched.core.gateway.company import is_full
-from zsched.core.gateway.job_need import CALM_S, Heard, JobNeed, age_of, other_s, told_job
+from zsched.core.gateway.job_need import CALM_S, JobNeed, other_s, told_job
 from zsched.core.gateway.shortfall import SHORT_RATIO, Shortfalls, is_short, shows_lack
-from zsched.core.gateway.spending import Spending
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds, speed_of
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
@@ -37,8 +36,6 @@ COMPARED_S = 12.0
 """What differs so soon after a move is the machine's doing; what changes later is the task's."""
 RECENT_S = 60.0
 """Older figures say nothing of the machine to which a task has come: the task may have changed since."""
-SAME_JOB_RATIO = 0.8
-"""CPU times per answer count as the same up to this quotient: both are means of some answers."""
 
 
 class _Most(Struct, frozen=True):
@@ -90,7 +87,7 @@ class _Known(Struct, frozen=True):
     """...and when."""
     memory_mb: float | None = None
     job: JobNeed | None = None
-    """What its worker has reported, or what robots see of its answers; ``None``: nothing so far."""
+    """What its worker has reported; ``None``: nothing so far."""
     is_job_old: bool = False
     """The job is a worker's that is to start again, by a changed recipe."""
     is_changed: bool = False
@@ -112,8 +109,6 @@ class Demands:
         self.shortfalls = Shortfalls()
         """What machines did not keep."""
         self._speeds = TaskSpeeds()
-        self._spending: dict[TaskId, Spending] = {}
-        """What the task's worker has spent on answers where the task is."""
 
     def learn(
         self,
@@ -122,7 +117,6 @@ class Demands:
         now: float,
         fastest: float | None = None,
         fair_cores: float = 0.0,
-        heard: Heard | None = None,
     ) -> bool:
         """Learn the task's need from its owner's profile; whether the need has changed.
 
@@ -139,7 +133,6 @@ class Demands:
             now: monotonic seconds.
             fastest: the highest speed among the candidates (``None``: the owner's).
             fair_cores: what a fair scheduler gives the task there while a job runs, >= 0; 0: nobody counts threads.
-            heard: what robots see of the answers of a worker that reports no jobs; ``None``: nothing.
         """
         self.shortfalls.end_doubts(task, now)
         load = profile.worker(task)
@@ -151,7 +144,6 @@ class Demands:
             return False
         if known.owner != profile.node:
             known = _came(known, profile.node, now)
-            self._spending.pop(task, None)
         found = replace(known, seen_s=now)
         if profile.cpu_used_cores is None:  # it is there, and shows by its memory, and says nothing of its need
             self._known[task] = known
@@ -160,11 +152,11 @@ class Demands:
             found = replace(found, full_at=now)
         is_new, is_calm = now - found.since < SETTLE_S, now - found.full_at > CALM_S
         before = found.before if now - found.since < COMPARED_S else None
-        job_cpu_s = self._job_cpu_s(task, load, None if is_new else heard, now)
-        if before is not None and job_cpu_s:
-            least_s = min(job_cpu_s, found.job_least_s or job_cpu_s)
+        jobs = load.jobs
+        if before is not None and jobs is not None and jobs.cpu_s:
+            least_s = min(jobs.cpu_s, found.job_least_s or jobs.cpu_s)
             found = replace(found, job_least_s=least_s)
-            self._compare_jobs(task, profile, least_s, before, is_told=load.jobs is not None)
+            self._compare_jobs(task, profile, least_s, before)
         if load.memory_mb is not None:
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         if load.cpu_cores is not None:
@@ -175,23 +167,18 @@ class Demands:
                 found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_starved, is_calm=is_calm
             )
             if before is not None:
-                has_jobs = job_cpu_s is not None
-                found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=has_jobs)
+                found = self._compared(task, profile, found, before, is_new=is_new, has_jobs=jobs is not None)
         speed = self._speeds.of(task, profile, is_there=True)
-        if heard is not None and load.jobs is None and not is_new:
-            hz = self._spending[task].answers_hz if task in self._spending else None
-            found = _with_heard(found, load, heard, job_cpu_s, hz, speed, is_calm=is_calm)
-        else:
-            is_known_calm = is_calm and now - found.since > CALM_S
-            found = _with_job(found, load, speed, is_new=is_new, is_calm=is_calm, is_known_calm=is_known_calm)
+        is_known_calm = is_calm and now - found.since > CALM_S
+        found = _with_job(found, load, speed, is_new=is_new, is_calm=is_calm, is_known_calm=is_known_calm)
         self._known[task] = found
-        age_s, is_seen = age_of(load.jobs, heard), False
-        if not is_new and age_s is not None and found.job is not None and found.work:
+        is_seen = False
+        if not is_new and jobs is not None and found.job is not None and found.work:
             is_seen = self.shortfalls.note(
                 task,
                 profile,
                 found.job,
-                age_s,
+                jobs.time_s if jobs.age_s is None else jobs.age_s,
                 need_cores=found.work / speed,
                 speed=speed,
                 fair_cores=fair_cores,
@@ -207,7 +194,6 @@ class Demands:
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more: one of the same name that comes later is another one (0043)."""
         self._known.pop(task, None)
-        self._spending.pop(task, None)
         self._speeds.forget(task)
         self.shortfalls.forget(task)
 
@@ -230,18 +216,7 @@ class Demands:
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
-    def _job_cpu_s(self, task: TaskId, load: WorkerLoad, heard: Heard | None, now: float) -> float | None:
-        """CPU time of a job: by the worker's report, else by its answers so far; ``None``: unknown."""
-        if load.jobs is not None:
-            return load.jobs.cpu_s
-        if heard is None or load.spent_s is None:
-            return None
-        if (spending := self._spending.get(task)) is None:
-            spending = self._spending[task] = Spending()
-        spending.absorb(load.spent_s, heard.counts, now)
-        return spending.per_answer_s
-
-    def _compare_jobs(self, task: TaskId, profile: Profile, least_s: float, before: _Before, *, is_told: bool) -> None:
+    def _compare_jobs(self, task: TaskId, profile: Profile, least_s: float, before: _Before) -> None:
         """What a job takes here and took where the task came from tells its speed, also of one that is short.
 
         A task's jobs differ, and may grow while it moves: it is slower here only if the least that they take exceeds
@@ -251,10 +226,7 @@ class Demands:
         """
         if not before.job_work_s:
             return
-        speed, benchmark = before.job_work_s / least_s, speed_of(profile)
-        if not is_told and speed >= SAME_JOB_RATIO * benchmark:
-            speed = benchmark
-        self._speeds.note(task, profile, min(speed, benchmark))
+        self._speeds.note(task, profile, min(before.job_work_s / least_s, speed_of(profile)))
 
     def _compared(
         self, task: TaskId, profile: Profile, found: _Known, before: _Before, *, is_new: bool, has_jobs: bool
@@ -389,24 +361,6 @@ def _told(load: WorkerLoad, speed: float, fastest: float, *, is_calm: bool) -> f
     if alone_s > 0.0:
         undone_hz = min(undone_hz, max(1.0 / alone_s - done_hz, 0.0))
     return max(use + undone_hz * jobs.cpu_s, 0.0) * speed
-
-
-def _with_heard(
-    known: _Known,
-    load: WorkerLoad,
-    heard: Heard,
-    cpu_s: float | None,
-    hz: float | None,
-    speed: float,
-    *,
-    is_calm: bool,
-) -> _Known:
-    """With the job of the owner's worker as robots see it; where too little is known yet it stays what it was."""
-    is_old = load.renewal is not Renewal.NONE
-    if cpu_s is None or hz is None:
-        return replace(known, is_job_old=known.is_job_old or is_old)
-    job = heard.job(cpu_s, hz, speed, known.job, is_calm=is_calm)
-    return replace(known, job=job, job_work_s=_with_jobs_work(known, cpu_s * speed), is_job_old=is_old)
 
 
 def _with_jobs_work(known: _Known, work_s: float) -> _Most:

@@ -10,10 +10,8 @@ import math
 from collections.abc import Mapping
 
 from zsched.core.gateway.demand import Demands
-from zsched.core.gateway.job_need import Heard, heard_of
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
-from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.fleet import Demand, Fleet, TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.model import NodeId, TaskId
@@ -123,13 +121,8 @@ class Gateway:
             has_share |= left is not None and self._shares.look_back(task, left, now)
         # What a job takes there is compared with what `score` foretells, so by the same share.
         fair = 0.0 if spec is None else self.share(spec, profile, self.demand(spec, profile).cpu_cores, 0.0)
-        heard = None if spec is None or tells_jobs(spec.worker) else self._heard(task, owner, now)
-        has_need = self.demands.learn(task, profile, now, fastest, fair, heard)
+        has_need = self.demands.learn(task, profile, now, fastest, fair)
         self.version += has_need or has_share
-
-    def _heard(self, task: TaskId, owner: NodeId, now: float) -> Heard | None:
-        telling = (profile for profile, at in self._profiles.values() if profile.answers and now - at <= self._ttl_s)
-        return heard_of(task, owner, telling)
 
     def forget(self, task: TaskId) -> None:
         """Know no need and no share of a task that is no more."""

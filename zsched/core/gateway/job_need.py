@@ -1,26 +1,17 @@
-"""GATEWAY: what one job of a task takes, as its worker tells it, or as robots see it of a foreign one.
+"""GATEWAY: what one job of a task takes, as its worker tells it.
 
 Knows: work and waits of a job, what of a time was which. Does not know: what a task needs on the mean
-(`zsched.core.gateway.demand`), how answers are measured (`zsched.core.profile.answers`).
+(`zsched.core.gateway.demand`).
 
 Jobs that come irregularly wait for each other, and the more of its time a worker is busy the longer, by more than the
 time of a job: ``u / (1 - u)`` times it, and some factor for how irregular they are (Kingman 1961, "The single server
 queue in heavy traffic"). That factor is the task's, and what it is seen to be on its owner counts on every machine. A
 queue that was taken along as it is would make a slow machine look as quick as its owner (docs/decisions/0123).
-
-A foreign worker tells nothing. Its processes are measured, so CPU time per answer is known. The rest of an answer's
-time is a wait, if the owner has had CPU to spare for some seconds: for other answers, as far as that is likely, and for
-other things, the same on every machine. On a full machine, and soon after, the rest is also a wait for a CPU. There
-other waits count as they were seen before, and what an answer takes longer than foreseen is remembered of that machine.
 """
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Iterable
-
-from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.profile import AnswerTime, Jobs, Profile
+from zsched.core.values.profile import Jobs
 from zsched.core.values.struct import Struct
 
 CALM_WAIT_RATIO = 0.1
@@ -33,8 +24,6 @@ CALM_S = 6.0
 """For so long the machine must have had CPU to spare: answers' time is a mean that follows later than the machine's."""
 BUSY_FROM, BUSY_TO = 0.01, 0.9
 """The part of its time that a worker is busy: beyond these nobody knows how long its queue is."""
-LIKELY_QUEUEING = 3.0
-"""Answers wait for each other by at most this factor (1: they come at random); longer waits are for other things."""
 MOST_QUEUE_RATIO = 20.0
 """No queue makes a job's age more than this many times its own time: whatever was told, it is much too late then."""
 ONE_THREAD_CORES = 1.1
@@ -42,7 +31,7 @@ ONE_THREAD_CORES = 1.1
 
 
 class JobNeed(Struct, frozen=True):
-    """One job's need, by its worker's report or by its answers, where it ran."""
+    """One job's need, by its worker's report, where it ran."""
 
     work_s: float
     """CPU time at speed 1."""
@@ -156,49 +145,3 @@ def _for_others(rest_s: float, known: JobNeed | None, *, is_calm: bool) -> float
     if is_calm:
         return max(rest_s, 0.0)
     return 0.0 if known is None else min(max(rest_s, 0.0), known.other_s)
-
-
-class Heard(Struct, frozen=True):
-    """The answers of one task's owner, by all robots that tell of any."""
-
-    age_s: float
-    """From an input to its answer at the owner: the median of the robots', so that one bad link says nothing."""
-    counts: tuple[tuple[NodeId, float], ...]
-    """(robot, how many answers to its own inputs it has counted)."""
-
-    def job(self, cpu_s: float, hz: float, speed: float, known: JobNeed | None, *, is_calm: bool) -> JobNeed:
-        """A job by its answers, which come ``hz`` times a second and take ``cpu_s`` each on a machine of ``speed``.
-
-        ``known``: what was known before. ``is_calm``: the machine has had CPU to spare for `CALM_S`.
-        """
-        if cpu_s > self.age_s:  # of several threads; of one all CPU time is work, whatever it waits for
-            cpu_s = _at_once(cpu_s, self.age_s, speed, known, is_calm=is_calm)
-        waits_s, crowded_s = self.age_s - cpu_s, crowd(hz * cpu_s) * cpu_s
-        if is_calm:
-            queue_s = min(waits_s, LIKELY_QUEUEING * crowded_s)
-            other_s = waits_s - queue_s
-        else:
-            other_s = _for_others(waits_s, known, is_calm=False)
-            queue_s = 0.0 if known is None else min(waits_s - other_s, known.queueing * crowded_s)
-        queueing = queue_s / crowded_s if crowded_s > 0.0 else 0.0
-        return JobNeed(work_s=cpu_s * speed, other_s=other_s, queueing=queueing, hz=hz, is_serial=False)
-
-
-def age_of(jobs: Jobs | None, heard: Heard | None) -> float | None:
-    """From a job's arrival to its end: by the worker's report, else by its answers; ``None``: nobody knows."""
-    if jobs is None:
-        return None if heard is None else heard.age_s
-    return jobs.time_s if jobs.age_s is None else jobs.age_s
-
-
-def heard_of(task: TaskId, owner: NodeId, profiles: Iterable[Profile]) -> Heard | None:
-    """What these profiles tell of the answers of the task's owner; ``None``: nothing."""
-    told: dict[NodeId, AnswerTime] = {}
-    for profile in profiles:
-        for one in profile.answers:
-            if (one.task, one.owner) == (task, owner):
-                told.setdefault(profile.node, one)  # each robot counts once
-    if not told:
-        return None
-    age_s = statistics.median([one.age_s for one in told.values()])
-    return Heard(age_s, tuple((robot, one.count) for robot, one in sorted(told.items())))

@@ -34,7 +34,6 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
         reasons={**node.resting(now), **node.workers.told(now)},
         echoes=node.round_trips.echoes(now),
         relay=node.relay_ends.told(now),
-        answers=node.answers.told(now),
         renewals=node.renewing.told,
         beats_now=todo.must_beat or now >= node.beat_at,
     )
@@ -55,7 +54,6 @@ def _look_for_hangs(node: Stages, todo: ToDo, now: float) -> None:
 
 
 def _on_sampled(node: Stages, event: ev.ProfileSampled, _todo: ToDo, now: float) -> None:
-    node.profiler.watch_use(node.timed_here())
     node.profiler.absorb(event.device, event.links, now)
 
 

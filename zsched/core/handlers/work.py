@@ -240,7 +240,6 @@ def _on_counted(node: Stages, event: ev.StreamsCounted, todo: ToDo, now: float) 
     for count in node.gaps.absorb(event.counts, now):
         _tell_gap(node, count, todo)
     node.hangs.absorb(event.counts, node.executors, now)
-    node.answers.absorb(node.timed(), event.counts, node.round_trips.seconds(), now)
 
 
 def _tell_gap(node: Stages, count: StreamCount, todo: ToDo) -> None:

@@ -26,7 +26,6 @@ from zsched.core.values.profile import (
     MAX_MEMORY_MB,
     MAX_RUNNABLE,
     MAX_TREND_DB_S,
-    AnswerTime,
     DeviceSample,
     Echo,
     Link,
@@ -131,7 +130,6 @@ class Profiler:
         self._worker_cpu: dict[TaskId, Ewma] = {}
         self._worker_memory: dict[TaskId, Ewma] = {}
         self._worker_runnable: dict[TaskId, Ewma] = {}
-        self._spent_s: dict[TaskId, float] = {}
         self._jobs: dict[TaskId, JobMeter] = {}
         self._device: DeviceSample | None = None
         self._sampled_at = -math.inf
@@ -163,15 +161,11 @@ class Profiler:
 
     def absorb(self, device: DeviceSample, links: tuple[LinkSample, ...], now: float) -> None:
         """Take one reading of the machine and its links in."""
-        elapsed_s = now - self._sampled_at
         self._device, self._sampled_at, self._is_new = device, now, True
         worker_cpu = {load.task: load.cpu_cores for load in device.workers}
         worker_memory = {load.task: load.memory_mb for load in device.workers}
         _absorb_use(self._cpu, self._worker_cpu, device.cpu_used_cores, worker_cpu, MAX_CPU_CORES, now)
         _absorb_use(self._memory, self._worker_memory, device.memory_used_mb, worker_memory, MAX_MEMORY_MB, now)
-        if elapsed_s <= STALE_S:
-            for task in self._spent_s:
-                self._spent_s[task] += elapsed_s * (_possible(worker_cpu.get(task), MAX_CPU_CORES) or 0.0)
         _absorb_known(self._pressure, device.cpu_pressure, 1.0, now)
         worker_runnable = {load.task: load.runnable for load in device.workers}
         if _possible(device.runnable, MAX_RUNNABLE) is None:  # nobody counts any more
@@ -189,10 +183,6 @@ class Profiler:
         self._gauges = {name: self._gauges.get(name) or Ewma(_gauge_tau_s(self._timing)) for name, _ in readings}
         for name, reading in readings:
             self._gauges[name].update(reading, now)
-
-    def watch_use(self, tasks: tuple[TaskId, ...]) -> None:
-        """Tell from now on what the workers of these tasks, and of no others, have used: their answers are timed."""
-        self._spent_s = {task: self._spent_s.get(task, 0.0) for task in tasks}
 
     def note_jobs(self, report: WorkerJobs, now: float) -> bool:
         """Take a worker's report of its jobs in; whether it is possible."""
@@ -265,7 +255,6 @@ class Profiler:
         reasons: Mapping[TaskId, str] = NO_REASONS,
         echoes: tuple[Echo, ...] = (),
         relay: str = "",
-        answers: tuple[AnswerTime, ...] = (),
         renewals: Mapping[TaskId, Renewal] = NO_RENEWALS,
         beats_now: bool = False,
     ) -> Profile | None:
@@ -279,7 +268,6 @@ class Profiler:
             reasons: why workers are not ready.
             echoes: which profiles this node has of others; they are no reason to send one.
             relay: what is wrong with this node's relay.
-            answers: how long those of foreign workers take; they are no reason to send one.
             renewals: which workers run by an old recipe.
             beats_now: a beat leaves at once: a profile that is nearly due goes with it, in the same packet.
         """
@@ -296,8 +284,8 @@ class Profiler:
             profile = replace(profile, progress=progress, relay=relay)
         if not is_due and self._sent is not None and not _differs(profile, self._sent):
             return None
-        if echoes or answers:
-            profile = replace(profile, echoes=echoes, answers=answers)
+        if echoes:
+            profile = replace(profile, echoes=echoes)
         self._sequence += 1
         self.has_news = self._sent is None or _kinds(profile) != _kinds(self._sent)
         self._sent, self._sent_at = profile, now
@@ -322,7 +310,6 @@ class Profiler:
                 state=state,
                 reason=reasons.get(task, ""),
                 renewal=renewals.get(task, Renewal.NONE),
-                spent_s=self._spent(loads.get(task)),
             )
             for task, state in sorted(states.items())
         )
@@ -342,11 +329,6 @@ class Profiler:
             runnable=self._runnable.value if is_measured else None,
             gauges=self._readings() if is_measured else (),
         )
-
-    def _spent(self, load: WorkerLoad | None) -> float | None:
-        if load is None or load.cpu_cores is None or load.task not in self._spent_s:
-            return None
-        return round(self._spent_s[load.task], 3)
 
     def _readings(self) -> Readings:
         """The means of all gauges, in as many digits as tell something."""

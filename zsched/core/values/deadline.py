@@ -12,8 +12,8 @@ from zsched.core.values.model import ScoreForm
 from zsched.core.values.plan import ReadyWhen
 
 TELLS_NOTHING = (
-    "this worker (ready: matching) does not tell how long its jobs take; its answers do, if each has its input's "
-    "timestamp, and if not its machines are judged by service, whatever the deadline"
+    "this worker (ready: matching) does not tell how long its jobs take: its machines are judged by service, "
+    "whatever the deadline"
 )
 
 
@@ -36,5 +36,5 @@ def deadline_fault(score: ScoreForm, cpu_weight: float) -> DeadlineFault | None:
 
 
 def tells_jobs(worker: WorkerSpec) -> bool:
-    """Whether a worker can tell of its jobs itself; of any other one the robots time the answers."""
+    """Whether a worker can tell of its jobs, by which a deadline counts."""
     return worker.ready_when is ReadyWhen.TOKEN

@@ -25,7 +25,6 @@ MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
 MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
-MAX_SUM = 1e12
 MAX_HELD_S = 3600.0
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
 
@@ -137,8 +136,6 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     report its jobs."""
     runnable: float | None = None
     """How many of its threads run or wait for a CPU, on the mean; ``None``: unknown."""
-    spent_s: float | None = None
-    """CPU seconds that it has used since some moment, if it is an owner's whose answers are timed; else ``None``."""
 
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
@@ -149,7 +146,6 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
         check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.runnable", self.runnable, 0.0, MAX_RUNNABLE)
-        check_range("worker.spent_s", self.spent_s, 0.0, MAX_SUM)
 
 
 class TaskProgress(Struct, frozen=True, kw_only=True):
@@ -162,23 +158,6 @@ class TaskProgress(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_name("progress.task", self.task)
         check_counter("progress.epoch", self.epoch)
-
-
-class AnswerTime(Struct, frozen=True, kw_only=True):
-    """How long the answers of a worker that tells nothing of its jobs take, as a robot's relay measures them."""
-
-    task: TaskId
-    owner: NodeId
-    age_s: float
-    """From an input at the owner to its answer there: without the robot's way, as far as that is measured."""
-    count: float
-    """Such answers of this owner to the robot's own inputs, since some moment."""
-
-    def __post_init__(self) -> None:
-        check_name("answer.task", self.task)
-        check_name("answer.owner", self.owner)
-        check_range("answer.age_s", self.age_s, 0.0, MAX_JOB_S)
-        check_range("answer.count", self.count, 0.0, MAX_SUM)
 
 
 class DeviceSample(Struct, frozen=True, kw_only=True):
@@ -261,8 +240,6 @@ class Profile(Struct, frozen=True, kw_only=True):
     """What is wrong with its relay (`zsched.core.profile.relay_ends`); at most `MAX_REASON` long; empty: nothing."""
     gauges: Readings = ()
     """Smoothed readings of its gauges (`zsched.core.values.gauges`)."""
-    answers: tuple[AnswerTime, ...] = ()
-    """Robots: of tasks with a deadline whose workers tell nothing of their jobs (`zsched.core.profile.answers`)."""
 
     def __post_init__(self) -> None:
         check_name("profile.node", self.node)

@@ -14,7 +14,7 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
 from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.gateway.job_need import CALM_S, LIKELY_QUEUEING, Heard, crowd
+from zsched.core.gateway.job_need import crowd
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 
@@ -39,44 +39,6 @@ def profile(
         workers=(load_of(state=state, cpu_cores=cores, memory_mb=mb, wanted_cores=wanted, jobs=jobs),),
         speed=speed,
     )
-
-
-def test_waits_for_a_cpu_are_no_other_waits_where_a_machine_is_hardly_ever_calm() -> None:
-    """Its load swings about the bound, and answers' time follows behind: one look says little."""
-    demands = Demands()
-
-    def stay(used: float, age_s: float, begin: float, for_s: float) -> float:
-        at = begin
-        while at < begin + for_s:
-            one = profile_of(cpu_used_cores=used, workers=(load_of(cpu_cores=0.4, spent_s=0.4 * at),))
-            demands.learn("merge", one, at, heard=Heard(age_s, (("robot1", 4.0 * at),)), fair_cores=1.0)
-            at += 0.5
-        return at
-
-    at = stay(1.0, 0.1, 0.0, 2 * CALM_S)
-    for _ in range(5):
-        at = stay(3.9, 0.9, at, 3.0)
-        at = stay(0.89 * 4.0, 0.9, at, CALM_S - 1.0)
-        job = demands.job("merge")
-        assert job is not None
-        assert job.other_s == pytest.approx(0.0)
-        assert (
-            demands.shortfalls.of("merge", profile_of(cpu_used_cores=3.9, workers=(load_of(cpu_cores=0.4),)))[1] > 5.0
-        )
-    stay(1.0, 0.9, at, 2 * CALM_S)
-    job = demands.job("merge")
-    assert job is not None
-    assert job.age_s(1.0, 4.0) == pytest.approx(0.9), "it waits for something else after all"
-    assert job.other_s == pytest.approx(0.8 - LIKELY_QUEUEING * 0.1 * crowd(0.4)), "all but what may be a queue"
-
-
-def test_a_program_of_few_answers_is_old_as_soon_as_it_is_told_so() -> None:
-    demands, heard = Demands(), Heard(0.1, (("robot1", 1.0),))
-    demands.expect_another("merge")
-    for at in range(10):
-        renewal = Renewal.DUE if at > 5 else Renewal.NONE
-        demands.learn("merge", profile_of(workers=(load_of(cpu_cores=0.4, renewal=renewal),)), float(at), heard=heard)
-    assert demands.is_replaced("merge", profile_of(workers=(load_of(cpu_cores=0.4),)))
 
 
 def learnt(*profiles: Profile, there: Profile | None = None, every_s: float = EVERY_S) -> Demand:

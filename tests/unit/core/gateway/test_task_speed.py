@@ -8,7 +8,6 @@ import pytest
 
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import COMPARED_S, RECENT_S, SETTLE_S, Demands
-from zsched.core.gateway.job_need import Heard
 from zsched.core.gateway.task_speed import MOST_RATIO, TaskSpeeds
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, WorkerState
@@ -40,27 +39,6 @@ def jobs_of(cpu_s: float, *, wanted_hz: float = 5.0, done_hz: float = 5.0) -> Jo
 def stay(demands: Demands, one: Profile, begin: float, lasts_s: float = 2 * COMPARED_S) -> float:
     """The task is on the node of ``one``, which looks the same for so long; answers when that ends."""
     return stay_differing(demands, (one,), begin, lasts_s)
-
-
-def ask(
-    demands: Demands,
-    one: Profile,
-    begin: float,
-    lasts_s: float = 2 * COMPARED_S,
-    *,
-    hz: float,
-    age_s: float = 0.3,
-    cores: float | None = None,
-) -> float:
-    """As `stay`, with a worker that tells nothing and answers so often; on the mean it uses ``cores``."""
-    (load,) = one.workers
-    at, mean = begin, load.cpu_cores if cores is None else cores
-    assert mean is not None
-    while at <= begin + lasts_s:
-        spending = replace(one, workers=(replace(load, spent_s=mean * at),))
-        demands.learn("merge", spending, at, heard=Heard(age_s, (("robot1", hz * at),)))
-        at += 0.5
-    return at
 
 
 # --- what counts where ---------------------------------------------------------------------------------------------
@@ -214,43 +192,6 @@ def test_more_jobs_of_the_same_kind_make_no_machine_slow_though_it_is_short() ->
     stay(demands, there, at)
     assert demands.speed("merge", there) == 1.0
     assert demands.at(NOTHING, profile("edge1")).cpu_cores == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(("hz", "speed"), [(9.0, 1.0), (2.25, 0.25)])
-def test_answers_of_a_worker_that_tells_nothing_tell_the_speed_as_jobs_do(hz: float, speed: float) -> None:
-    """It is short on the next machine: for more jobs of the same kind, or for jobs that take longer there."""
-    demands = Demands()
-    at = ask(demands, profile("edge1", cores=0.2), 0.0, hz=2.0)
-    there = profile(cores=0.9, others=3.1, wanted=1.0)
-    ask(demands, there, at, hz=hz, age_s=1.0)
-    assert demands.speed("merge", there) == pytest.approx(speed)
-
-
-@pytest.mark.parametrize(("age_s", "next_s"), [(0.0, 0.003), (0.002, 0.008)])
-def test_answers_that_took_hardly_longer_than_the_way_tell_no_speed_by_their_age(age_s: float, next_s: float) -> None:
-    """A robot's way is taken off their age, and is not known better than to some milliseconds."""
-    demands = Demands()
-    at = ask(demands, profile("edge1", cores=0.8), 0.0, hz=100.0, age_s=age_s)
-    ask(demands, profile(cores=0.8), at, hz=100.0, age_s=next_s)
-    assert demands.speed("merge", profile()) == 1.0
-    assert demands.at(NOTHING, profile("edge1")).cpu_cores == pytest.approx(0.8)
-
-
-@pytest.mark.parametrize(("cores", "speed"), [(0.24, 1.0), (0.16, 1.0), (0.3, 2 / 3)])
-def test_cpu_times_of_some_answers_differ_by_chance(cores: float, speed: float) -> None:
-    demands = Demands()
-    at = ask(demands, profile("edge1", cores=0.2), 0.0, hz=2.0)
-    ask(demands, profile(cores=0.9), at, hz=2.0, cores=cores)
-    assert demands.speed("merge", profile()) == pytest.approx(speed)
-
-
-def test_too_few_answers_tell_no_speed_and_a_lack_does() -> None:
-    """As without any: it came with enough, and is short here."""
-    for there, speed in ((profile(cores=0.2), 1.0), (profile(cores=0.9, others=3.1, wanted=1.0), 0.2)):
-        demands = Demands()
-        at = ask(demands, profile("edge1", cores=0.2), 0.0, 60.0, hz=0.3)
-        ask(demands, there, at, hz=0.3, cores=0.8)
-        assert demands.speed("merge", there) == pytest.approx(speed)
 
 
 def test_figures_from_long_before_it_was_seen_again_tell_nothing_of_the_machine() -> None:

@@ -256,40 +256,6 @@ def test_a_worker_that_was_never_measured_has_no_figure() -> None:
     assert profile.cores_of("merge") == 0.0
 
 
-def test_what_a_worker_whose_answers_are_timed_has_spent_is_told() -> None:
-    """Half a core in every other sample; samples come as they come."""
-    profiler, now, spent_s = make_profiler(), 0.0, 0.0
-    told: list[float | None] = []
-    for step in range(100):
-        is_watched = 20 <= step < 90
-        profiler.watch_use(("merge",) if is_watched else ())
-        period_s, cores = (0.2 if step % 3 else 1.0), (0.5 if step % 2 else 0.0)
-        now += period_s
-        profiler.absorb(device(2.0, 1000.0, load(cores)), (), now)
-        spent_s += period_s * cores if is_watched else 0.0
-        profile = profiler.publishable(READY, is_draining=False, now=now)
-        if profile is not None:
-            told.append(profile.workers[0].spent_s)
-            assert told[-1] == (pytest.approx(spent_s, abs=0.001) if is_watched else None)
-    assert [one for one in told if one is not None][-1] > 5.0
-
-
-def test_nothing_was_spent_while_nobody_looked_for_long() -> None:
-    profiler = make_profiler()
-    for at in (0.0, 1.0, 2.0, 100.0, 101.0):
-        profiler.watch_use(("merge",))
-        profiler.absorb(device(2.0, 1000.0, load(0.5)), (), at)
-    assert taken(profiler, 101.0).workers[0].spent_s == pytest.approx(1.5)
-
-
-def test_what_nobody_measures_has_spent_nothing_known() -> None:
-    profiler = make_profiler()
-    for step in range(100):
-        profiler.watch_use(("merge",))
-        profiler.absorb(device(2.0, 1000.0, load(None)), (), 0.2 * step)
-    assert taken(profiler, 20.0).workers[0].spent_s is None
-
-
 def test_states_come_from_the_node_not_from_the_sample() -> None:
     profiler = make_profiler()
     profiler.absorb(device(2.0, 1000.0, load(0.5, 100.0, WorkerState.READY)), (), now=0.0)
@@ -636,7 +602,7 @@ def test_of_somebody_else_s_worker_its_jobs_are_told_and_their_use() -> None:
     assert worker.jobs is not None
     assert worker.jobs.done_hz == pytest.approx(5.0, rel=0.01)
     assert worker.cpu_cores == pytest.approx(0.2, rel=0.01)
-    assert (worker.memory_mb, worker.spent_s, worker.runnable) == (None, None, None)
+    assert (worker.memory_mb, worker.runnable) == (None, None)
     assert taken(profiler, 100.0).workers == (WorkerLoad(task="merge", state=WorkerState.READY),), "nobody measures"
 
 
