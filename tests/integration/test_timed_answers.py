@@ -1,7 +1,9 @@
-"""A real foreign worker: robots time its answers."""
+"""A real foreign worker: robots time its answers, and leave one whose answers have ended."""
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any
 import pytest
 
 from support.feeding import fed
+from zsched_lab.fleet.netbed import descendants_running
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long
@@ -20,7 +23,7 @@ WAIT_S, RATE_HZ = 0.06, 5.0
 
 @contextmanager
 def fleet_of(folder: Path, *, keeps_stamp: bool) -> Iterator[Testbed]:
-    tree = echo_fleet(robots=1, edges=1, timing="wired", worker=("python", str(WORKER)))
+    tree = echo_fleet(robots=1, edges=2, timing="wired", worker=("python", str(WORKER)))
     task = tree["tasks"][TASK]
     task["worker"] |= {"ready": "matching", "env": {"KEEPS_STAMP": f"{keeps_stamp:d}"}}
     task["inputs"] = [{"from": "{robot}/in", "to": f"{{target}}/{TASK}/{{robot}}/in", "class": "latest"}]
@@ -28,7 +31,7 @@ def fleet_of(folder: Path, *, keeps_stamp: bool) -> Iterator[Testbed]:
     with Testbed(folder, tree) as bed:
         bed.init()
         bed.start()
-        assert bed.wait_settled() == "edge1"
+        bed.wait_settled()
         with fed(bed, RATE_HZ):
             yield bed
 
@@ -46,3 +49,15 @@ def test_answers_are_timed_and_exactly_so_by_their_input_s_timestamp(tmp_path: P
         assert told is not None
         assert (told["paired_hz"] is not None) is keeps_stamp
         assert told["answer_s"] >= WAIT_S or not keeps_stamp
+
+
+def test_a_worker_that_takes_inputs_and_answers_no_more_is_a_problem_and_is_left(tmp_path: Path) -> None:
+    with fleet_of(tmp_path, keeps_stamp=True) as bed:
+        owner = bed.wait_settled()
+        bed.wait(lambda: shown(bed), 60, "answers flow")
+        (pid,) = descendants_running(bed.pid(owner), str(WORKER))
+        os.kill(pid, signal.SIGUSR1)
+        told = f"{owner} has had inputs of this robot and answered none of them"
+        bed.wait(lambda: any(told in one for one in bed.task("robot1")["problems"]), 30, "status says so")
+        bed.wait(lambda: bed.wait_settled() not in (None, owner), 60, "another owner")
+        bed.wait(lambda: not bed.task("robot1")["problems"], 60, "answers of the next owner")

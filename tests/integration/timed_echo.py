@@ -1,4 +1,7 @@
-"""An echo worker without zsched's library; ``KEEPS_STAMP=0``: it does not put the inputs' timestamps on its answers."""
+"""An echo worker without zsched's library; ``KEEPS_STAMP=0``: it does not put the inputs' timestamps on its answers.
+
+After SIGUSR1 it takes inputs and answers none.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,8 @@ def main() -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
+    hangs: list[int] = []
+    signal.signal(signal.SIGUSR1, lambda number, _frame: hangs.append(number))
     waiting: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
     with zenoh.open(zenoh.Config.from_file(os.environ["ZSCHED_ZENOH_CONFIG"])) as session:
         subscriber = session.declare_subscriber(f"{PREFIX}/*/in", waiting.put)
@@ -31,6 +36,8 @@ def main() -> int:
             try:
                 sample = waiting.get(timeout=0.2)
             except queue.Empty:
+                continue
+            if hangs:
                 continue
             time.sleep(WAIT_S)
             robot = str(sample.key_expr).split("/")[-2]

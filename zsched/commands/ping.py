@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
-from zsched.adapters.network.node_ping import Pinged, ping
+from zsched.adapters.network.node_ping import LARGE_S, SIZES, Pinged, ping
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, fleet_here, name_here
 from zsched.commands.common import CliError, Json, nearest, print_json, say
@@ -47,7 +47,7 @@ class Way(Struct, frozen=True, kw_only=True):
     """One way to the node, and what came of it."""
 
     name: str
-    """``control``, ``data``, or ``daemon``: through the daemon on this machine."""
+    """``control``, ``data``, ``data`` with a size, or ``daemon``: through the daemon on this machine."""
     endpoint: str
     """The address that was dialled, or the socket."""
     found: Pinged
@@ -94,22 +94,28 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
     """The node's own addresses, measured at the same time."""
     spec, keys, text = fleet.node(question.node), Keyspace(fleet.name), session_text(fleet, Side.VISIT)
     selectors = {CONTROL: keys.status(spec.name, asker_in(fleet, me)), DATA: keys.role(spec.name, "*")}
-    dialled = [(name, endpoint) for name, endpoint in ((CONTROL, spec.control_at), (DATA, spec.data_at)) if endpoint]
+    dialled = [
+        (name, endpoint, large)
+        for name, endpoint in ((CONTROL, spec.control_at), (DATA, spec.data_at))
+        for large in (SIZES if name == DATA else ("",))
+        if endpoint
+    ]
 
-    def measured(one: tuple[str, str]) -> Way:
-        name, endpoint = one
+    def measured(one: tuple[str, str, str]) -> Way:
+        name, endpoint, large = one
         config = zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
         found = ping(
             config,
             selectors[name],
-            count=question.count,
-            timeout_s=question.timeout_s,
+            count=1 if large else question.count,
+            timeout_s=LARGE_S if large else question.timeout_s,
             interval_s=question.interval_s,
             needs_answer=name == CONTROL,
+            size=SIZES[large] if name == DATA else 0,
         )
-        return Way(name=name, endpoint=endpoint, found=found)
+        return Way(name=f"{name} {large}".strip(), endpoint=endpoint, found=found)
 
-    pool = ThreadPoolExecutor(max_workers=2)
+    pool = ThreadPoolExecutor(max_workers=len(dialled) or 1)
     try:
         yield from pool.map(measured, dialled)
     finally:
@@ -182,7 +188,7 @@ def _lines(node: NodeId, ways: list[Way], heard: Json) -> Iterator[str]:
     for way in ways:
         found, trips = way.found, way.found.round_trips_s
         place = f"through the daemon of {way.endpoint}" if way.name == DAEMON else way.endpoint
-        head = f"{way.name:<8} {place}: "
+        head = f"{way.name:<11} {place}: "
         if not trips:
             why = found.error or f"no answer to {found.missed} questions"
             yield f"{head}{node} does not answer: {why}"

@@ -77,6 +77,10 @@ class PastValue(Struct, frozen=True, kw_only=True):
     reason: str
 
 
+UNREADY_SHOWN_S = 2.0
+"""A slot that no worker takes for longer is a problem: a handover takes less."""
+
+
 class Unready(Struct, frozen=True, kw_only=True):
     """A slot whose worker our relay does not see: what it misses there, and since when."""
 
@@ -372,11 +376,26 @@ class Stages:
             is_ours=stays == self.me,
             is_enough=self._is_enough(spec),
         )
+        if owner is not None and self.unanswered_s(spec.name, now) is not None:
+            unseen |= {owner}
         if owner is not None and self.rounds.tasks[spec.name].judge.is_overdue(now):
             left |= {owner}
         if not in_grace and not unproven and not unfit and not unseen and not left:
             return NO_DOUBTS
         return Doubts(in_grace=in_grace, unproven=unproven, unseen=unseen, left=left, unfit=unfit)
+
+    def unanswered_s(self, task: TaskId, now: float) -> float | None:
+        """For how long the owner has answered nothing here that it should have; ``None``: not too long.
+
+        Not while our relay misses its worker for longer, for that is told by itself; nor while the library says that
+        the worker is at work.
+        """
+        value, unready = self.registers[task].value, self.unready.get(task)
+        told = None if value.owner is None else self.gateway.fresh(value.owner, now)
+        load = None if told is None else told.worker(task)
+        is_at_work = load is not None and (load.unended_s is not None or (load.jobs is not None and load.jobs.backlog))
+        is_told = unready is not None and now - unready.since >= UNREADY_SHOWN_S
+        return None if is_told or is_at_work else self.hangs.rhythms.overdue_s(task, value.epoch, now)
 
     def counts_age_s(self, now: float) -> float:
         """For how long the relay has told no counts; 0 before the first."""

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 from zsched.core.executor.handover import Executor, Phase
+from zsched.core.executor.rhythm import HUNG_TIMES
 from zsched.core.executor.rollouts import waiting
 from zsched.core.route.rates import STALE_S
 from zsched.core.scheduler.eligibility import is_of_machine, may_get
@@ -16,7 +17,7 @@ from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import joined
-from zsched.core.stages import Stages, Unready
+from zsched.core.stages import UNREADY_SHOWN_S, Stages, Unready
 from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
@@ -63,15 +64,12 @@ RECOVER_AFTER_S = 60.0
 A recovery beside electors that come back makes two fleets of one.
 """
 RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
-HUNG_TIMES = 16.0
-"""A job that takes so many times as long as jobs have taken may hang; one that takes less than
-`zsched.core.profile.jobs.UNENDED_S` does not..."""
+HUNG_LEAST_S = 8.0
+"""A job that takes `HUNG_TIMES` as long as jobs have taken may hang; one that takes less than this does not..."""
 HUNG_FIRST_S = 30.0
 """...and, of a worker that has ended none of late, one that takes so long: a first job may load a model."""
 LATE_RATIO = 0.5
 """A deadline that so many of a task's jobs miss is a problem, wherever the task is."""
-UNREADY_SHOWN_S = 2.0
-"""A slot that no worker takes for longer is a problem: a handover takes less."""
 
 
 def build_snapshot(node: Stages, now: float) -> Snapshot:
@@ -514,6 +512,12 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
                 f"the worker on {name} is ready, and {what}: {name} gets nothing for this robot; "
                 f"`zsched ping {name}` tells whether its data session answers here"
             )
+    if (waited_s := node.unanswered_s(task.name, now)) is not None:
+        yield (
+            f"{owner} has had inputs of this robot and answered none of them for {waited_s:.0f} s: its worker hangs, "
+            f"or what is large does not reach it (`zsched ping {owner}` tries that); `zsched logs {task.name}`, "
+            f"`zsched restart {task.name}`"
+        )
     since = _unready_since(node, executor)
     if is_server_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.served_by} for {now - since:.0f} s"
@@ -522,7 +526,7 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
 
 def _hangs(load: WorkerLoad) -> bool:
     """Whether there is work, and no job has ended for many times as long as one took before."""
-    bound_s = HUNG_FIRST_S if load.jobs is None else HUNG_TIMES * load.jobs.time_s
+    bound_s = HUNG_FIRST_S if load.jobs is None else max(HUNG_LEAST_S, HUNG_TIMES * load.jobs.time_s)
     return load.unended_s is not None and load.unended_s >= bound_s
 
 

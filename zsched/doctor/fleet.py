@@ -8,8 +8,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final, TypeVar
 
+from zsched.adapters.network.node_ping import LARGE_S, SIZES, ping
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, fleet_hash
 from zsched.core.values.struct import replace
 from zsched.doctor.daemon import judged_lag, lacks_of_owners, problems_of
@@ -27,7 +29,12 @@ from zsched.doctor.model import (
     skipped,
     warned,
 )
-from zsched.doctor.network import addresses, connected
+from zsched.doctor.network import Address, addresses, connected
+from zsched.errors import ConfigError
+from zsched.runtime.access_rules import Side
+from zsched.runtime.tls import session_text
+from zsched.sessions.config import client_config
+from zsched.wire.keyspace import Keyspace
 
 T = TypeVar("T")
 HASH_DIGITS: Final = 8
@@ -46,14 +53,37 @@ def answer(scene: Scene) -> Result:
 
 
 def addresses_answer(scene: Scene) -> Result:
-    """Whether the addresses of all nodes that live take connections from here."""
+    """Whether the addresses of all nodes that live take connections from here, and data sessions large samples."""
     named = addresses(scene.fleet.nodes)
     living = [address for address in named if address.node in scene.statuses or _is_heard(scene, address.node)]
     if not living:
         return skipped("no living node has an address in the fleet file")
-    return joined(
-        connected(living), passed(f"{counted(len(living), 'addresses')} of living nodes, all take connections")
-    )
+    shut = list(connected(living))
+    found = shut or _small_only(scene, [address for address in living if address.session == "data"])
+    return joined(found, passed(f"{counted(len(living), 'addresses')} of living nodes, all take connections"))
+
+
+def _small_only(scene: Scene, living: list[Address]) -> Iterator[Result]:
+    """A result for each data session that is asked in vain with a large question."""
+    keys = Keyspace(scene.fleet.name)
+    try:
+        text = session_text(scene.fleet, Side.VISIT)
+    except (ConfigError, ValueError):
+        return  # a check of its own says what is wrong with that file
+
+    def lost(address: Address) -> str:
+        selector = keys.role(address.node, "*")
+        config = client_config(connect=(address.endpoint,), timing=scene.fleet.timing, operator_json5=text)
+        for name, size in SIZES.items():
+            if ping(config, selector, count=1, timeout_s=LARGE_S, interval_s=0, needs_answer=False, size=size).missed:
+                return name or "1 KiB"
+        return ""
+
+    with ThreadPoolExecutor(max_workers=16) as pool:
+        for address, size in zip(living, pool.map(lost, living), strict=True):
+            if size:
+                fix = "a link in between loses large packets: give both machines' interfaces the smaller MTU (ip link)"
+                yield failed(f"{address} takes no {size} from here", fix=fix)
 
 
 def _is_heard(scene: Scene, name: str) -> bool:

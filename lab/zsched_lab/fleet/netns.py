@@ -195,6 +195,10 @@ class Network:
         rules = (f"{way} tcp {end} {port} drop" for way in ways for end in ("dport", "sport"))
         self._set(name, "port", *rules)
 
+    def keep_out_large(self, name: str, most: int) -> None:
+        """Packets of more than ``most`` bytes to this machine vanish, and nobody is told; small ones pass."""
+        self._set(name, "large", f"in iifname {INTERFACE} meta length > {most} drop")
+
     def lose(self, percent: int, *names: str) -> None:
         """This many of 100 packets that come to each of ``names`` are lost, at random."""
         for name in names:

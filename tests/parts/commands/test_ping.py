@@ -102,14 +102,15 @@ def test_both_sessions_are_measured_and_both_ears_told(node: Node) -> None:
     node.open_data()
     result = run("edge1", "--count", "3", "--interval", "0", "--json")
     found = ways(result)
-    assert (result.exit_code, set(found)) == (0, {"control", "data"})
+    assert (result.exit_code, set(found)) == (0, {"control", "data", "data 64 KiB", "data 1 MiB"})
+    assert {found[way]["answered"] for way in ("data 64 KiB", "data 1 MiB")} == {1}
     assert (found["control"]["answered"], found["control"]["endpoint"]) == (3, node.control)
     assert SLOW_S <= found["control"]["least_s"] <= found["control"]["mean_s"] <= found["control"]["most_s"]
     assert (found["data"]["answered"], found["data"]["missed"]) == (3, 0)
     assert faults(json.loads(result.stdout)) == []
     assert json.loads(result.stdout)["heard"] == {"edge1": {"robot1": "gone"}}
     text = run("edge1", "-c", "1").stdout.splitlines()
-    assert text[0].startswith(f"control  {node.control}: 1 of 1 answered, ")
+    assert text[0].startswith(f"control     {node.control}: 1 of 1 answered, ")
     assert text[-1] == "edge1 finds robot1 gone"
 
 
@@ -117,7 +118,7 @@ def test_a_session_that_is_not_there_is_told_and_the_other_measured(node: Node) 
     node.open_control()
     result = run("edge1", "-c", "1")
     assert result.exit_code == 1
-    assert f"data     {node.data}: edge1 does not answer: " in result.stdout
+    assert f"data        {node.data}: edge1 does not answer: " in result.stdout
 
 
 def test_a_session_of_somebody_else_is_no_answer(node: Node) -> None:

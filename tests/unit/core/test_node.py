@@ -1326,3 +1326,24 @@ def test_utilities_of_who_has_no_vote_are_nothing_that_comes_late(voter: str, la
     node = started()
     node.handle(ev.UtilityReceived(gather=77, utilities=Utilities(voter=voter, vectors=())), 100.0)
     assert node.counters["utility_late"] == late
+
+
+def test_an_owner_that_has_ceased_to_answer_is_one_that_this_robot_does_not_reach() -> None:
+    """Inputs flow, and answers have ended."""
+    node = started(learnt=allocation_of(1, "edge1"))
+    for event in (ev.SlotReady(task="merge", epoch=1), ev.SlotFlipped(task="merge", epoch=1)):
+        node.handle(event, 100.5)
+    told = []
+    for second in range(12):
+        at, taken, given = 101.0 + second, 10 * second, min(10 * second, 60)
+        count = StreamCount(stream="merge/in/0", messages=taken, acknowledged=given, in_flight=taken - given)
+        for tenth in range(9):  # a node that stood still begins again
+            node.handle(ev.DeadlineReached(), at - 0.9 + tenth / 10)
+        node.handle(ev.StreamsCounted(counts=(count,)), at)
+        problems = build_snapshot(node, at).tasks[0].problems
+        is_shown = any("edge1 has had inputs of this robot and answered none" in one for one in problems)
+        told.append((is_shown, "edge1" in node._doubts(FLEET.tasks[0], at).unseen))
+    assert told == [(second >= 10, second >= 10) for second in range(12)]
+    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 112.0)
+    assert node.unanswered_s("merge", 112.5) is not None
+    assert node.unanswered_s("merge", 114.5) is None, "that its worker is missed is told by itself"

@@ -6,6 +6,8 @@ Knows: zenoh sessions, round trips. Does not know: which question it is, what th
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 import zenoh
@@ -16,6 +18,10 @@ from zsched.guard import guarded
 
 CONNECT_S: Final = 2.0
 """How long an address is waited for that neither takes a connection nor refuses it."""
+SIZES: Final = {"": 1 << 10, "64 KiB": 1 << 16, "1 MiB": 1 << 20}
+"""{name: bytes} of what a data session is asked with: a way may carry small packets and lose each full one."""
+LARGE_S: Final = 10.0
+"""A large question has so long, for a radio of 1 Mbit/s."""
 
 
 class Pinged(Struct, kw_only=True):
@@ -32,16 +38,18 @@ class Pinged(Struct, kw_only=True):
     """To the last question that was answered."""
 
 
-def ping(config: str, selector: str, *, count: int, timeout_s: float, interval_s: float, needs_answer: bool) -> Pinged:
+def ping(
+    config: str, selector: str, *, count: int, timeout_s: float, interval_s: float, needs_answer: bool, size: int = 0
+) -> Pinged:
     """Ask ``selector`` on a session of ``config``, ``count`` times; blocks until all is said, or late.
 
-    Without ``needs_answer`` it is enough that the other end says that nobody has more to say.
+    Without ``needs_answer`` it is enough that the other end says that nobody has more to say. Each question carries
+    ``size`` bytes.
     """
     zenoh.init_log_from_env_or("off")
     found = Pinged()
-    errand = guarded(
-        _ask_on, config, selector, count, timeout_s, interval_s, needs_answer, found, name="ping", is_lasting=False
-    )
+    ask = partial(_ask, selector=selector, timeout_s=timeout_s, needs_answer=needs_answer, size=size, found=found)
+    errand = guarded(_ask_on, config, count, interval_s, ask, found, name="ping", is_lasting=False)
     errand.start()
     errand.join(CONNECT_S + count * (timeout_s + interval_s))
     if found.opened_s is None and not found.error:
@@ -49,9 +57,7 @@ def ping(config: str, selector: str, *, count: int, timeout_s: float, interval_s
     return found
 
 
-def _ask_on(
-    config: str, selector: str, count: int, timeout_s: float, interval_s: float, needs_answer: bool, found: Pinged
-) -> None:
+def _ask_on(config: str, count: int, interval_s: float, ask: Callable[[zenoh.Session], None], found: Pinged) -> None:
     began = monotonic_s()
     try:
         session = zenoh.open(zenoh.Config.from_json5(config))
@@ -63,16 +69,17 @@ def _ask_on(
         for number in range(count):
             if number:
                 threading.Event().wait(interval_s)
-            _ask(session, selector, timeout_s, needs_answer, found)
+            ask(session)
 
 
-def _ask(session: zenoh.Session, selector: str, timeout_s: float, needs_answer: bool, found: Pinged) -> None:
+def _ask(session: zenoh.Session, selector: str, timeout_s: float, needs_answer: bool, size: int, found: Pinged) -> None:
     began = monotonic_s()
     replies = session.get(
         selector,
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=timeout_s,
+        payload=bytes(size) if size else None,
         priority=zenoh.Priority.INTERACTIVE_HIGH,
         express=True,
     )

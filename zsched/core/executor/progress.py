@@ -22,6 +22,7 @@ from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
 from zsched.core.executor.handover import Executor, Phase
+from zsched.core.executor.rhythm import Rhythms
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import RecordStory, RestartWorker
 from zsched.core.scheduler.probation import LIMIT_S
@@ -187,10 +188,11 @@ class HangJudge:
 
 
 class HangWatch:
-    """Both views of one node, over all tasks that say `output_deadline_s`."""
+    """Both views of one node, over all tasks that say `output_deadline_s`, and the rhythm of all others."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._progress = Progress(())
+        self.rhythms = Rhythms()
         self._judge = HangJudge()
         self._back_at: dict[NodeId, float] = {}
         """{robot: when it was heard again after a silence}."""
@@ -209,6 +211,7 @@ class HangWatch:
         self._specs = {spec.name: spec for spec in fleet.tasks if spec.worker.output_deadline_s is not None}
         self._voters = fleet.voters
         self._progress.adopt(tuple(self._specs.values()))
+        self.rhythms.adopt(fleet.tasks)
         for task in [task for task in known if task not in self._specs]:
             self._judge.note_worker(task, WorkerState.STOPPED, now)
         for task in [task for task in self._specs if task not in known and task in workers]:
@@ -217,6 +220,7 @@ class HangWatch:
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Our relay has counted."""
+        self.rhythms.absorb(counts, executors, now)
         if self._specs:
             self._progress.absorb(counts, executors, now)
 
@@ -231,6 +235,8 @@ class HangWatch:
 
     def note_lag(self, lag_s: float, now: float) -> None:
         """This node stood still for this many seconds; a pause of half a deadline or more starts all waits again."""
+        if lag_s >= COUNT_S / 2:
+            self.rhythms.begin_again()
         for task, spec in self._specs.items():
             if lag_s >= max(spec.worker.output_deadline_s or 0.0, COUNT_S) / 2:
                 self._progress.begin_again(task, now)

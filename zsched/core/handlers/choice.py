@@ -16,6 +16,7 @@ from zsched.core.profile.profile import BLIND_S
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Proposal
+from zsched.core.values.profile import WorkerState
 from zsched.core.values.struct import replace
 
 BLIND = f"nothing of this machine has been measured for {BLIND_S:g} s: a driver or a disk hangs; see the journal"
@@ -75,6 +76,10 @@ def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float)
     failed = failed_workers(profile)
     values = node.values()
     owned = {name for name, value in values.items() if value.owner == profile.node}
+    for task in owned:
+        load = profile.worker(task)
+        if load is not None and load.state is not WorkerState.READY:
+            node.hangs.rhythms.begin_again(task)
     is_to_leave = bool(owned) and (profile.draining or bool(owned & failed) or bool(owned & given_away(profile)))
     # With an orphan about, this may be the candidate that the task waits for.
     todo.must_decide |= is_to_leave or any(node.is_orphan(value.owner) for value in values.values())

@@ -27,7 +27,7 @@ QUEUE_S = 2.0
 """A longer wait shows that the worker is behind, and not that several jobs came at once."""
 MAX_AT_ONCE = 64.0
 """No worker runs more jobs at a time: a sum of times that rises faster was made up."""
-UNENDED_S = 8.0
+UNENDED_S = 1.0
 """For less time than this nobody need be told that no job has ended."""
 LEAST_HZ = 1e-3
 """At a lower rate there are too few jobs for a mean: the last one stands."""
