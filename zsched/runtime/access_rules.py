@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from typing import Any, Final
 
+from zsched.core.route.ros2 import BUFFERS, is_rmw_key
 from zsched.core.route.route import widened
 from zsched.core.values.certificates import Role, accepted
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, StreamRule, TaskSpec, runs_worker
@@ -161,9 +162,11 @@ def _graph(fleet: Fleet) -> tuple[str, ...]:
 
 
 def _with_suffixes(keys: Iterable[str]) -> Iterator[str]:
-    """The keys, and what zsched and zenoh's advanced publishers put behind them."""
+    """The keys, and what zsched, zenoh's advanced publishers and rmw_zenoh's buffers put behind them."""
     for key in keys:
         yield key
+        if is_rmw_key(key):
+            yield f"{key}{BUFFERS}"
         yield f"{key}/{ROOT}/{ANYTHING}"
         yield f"{key}/{ADVANCED}/{ANYTHING}"
 

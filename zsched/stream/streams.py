@@ -42,6 +42,7 @@ from zsched.ipc.protocol import DaemonGone, StreamKeys, StreamsTaken
 from zsched.latch import Latch
 from zsched.log_limit import limit_library
 from zsched.relay.streams.acks import Acks
+from zsched.relay.streams.given import PLAIN, Given
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.tokens import Tokens
 from zsched.sessions.closing import APPLICATION_CLOSE_S
@@ -50,7 +51,7 @@ from zsched.sessions.link_sockets import opened
 from zsched.sessions.problems import why_not_open
 from zsched.sessions.puts import Payload, put_arguments
 from zsched.stream.link import Link, RefusedError, place_of
-from zsched.stream.samples import PLAIN, Given, Received
+from zsched.stream.samples import Received
 from zsched.stream.task import OwnTask
 from zsched.wire.keyspace import Keyspace
 

@@ -44,12 +44,12 @@ from zsched.ipc.pipe import write_frame
 from zsched.ipc.protocol import MAX_KEYS, StreamKeys
 from zsched.relay import application
 from zsched.relay.application import Application
+from zsched.relay.streams.given import Given
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
 from zsched.sessions.config import data_config, worker_config
 from zsched.stream import Received, Streams, streams
 from zsched.stream.link import Link
-from zsched.stream.samples import Given
 from zsched.stream.task import OwnTask
 from zsched.wire import codec as wire
 from zsched.worker import Received as Input

@@ -213,3 +213,12 @@ def test_guests_and_operators_read_streams_and_put_nothing() -> None:
 def test_a_visitor_believes_members_only() -> None:
     assert may(Side.VISIT, "edge1", "ingress", "reply", KEYS.status("robot1", "ana"))
     assert not may(Side.VISIT, "screen.guest", "ingress", "reply", KEYS.status("robot1", "ana"))
+
+
+def test_images_of_a_ros_worker_may_come_beside_their_topics_key() -> None:
+    ros = 'ros2: {outputs: [{topic: "/{robot}/seen", worker_topic: "/{target}/seen"}]}'
+    text = TEXT.replace("    services:", f"    {ros}\n    services:")
+    key = "0/edge1/seen/sensor_msgs::msg::dds_::Image_/RIHS01_x"
+    for whose, is_let_in in (("edge1", True), ("edge2", False)):
+        assert may(Side.DATA, whose, "ingress", "put", key, text) == is_let_in
+        assert may(Side.DATA, whose, "ingress", "put", f"{key}/_buf_cpu", text) == is_let_in

@@ -4,11 +4,14 @@ Knows: the key, token and attachment formats of rmw_zenoh and of the ros2dds bri
 messages (payloads stay CDR bytes), where in a file a name stands.
 
 rmw_zenoh:  data ``<domain>/<name>/<type>/<hash>``; token ``@ros2_lv/<domain>/<zid>/<node id>/<entity id>/<kind>/
-<enclave>/<namespace>/<node>[/<name>/<type>/<hash>/<qos>]``, every ``/`` inside a field written ``%``.
+<enclave>/<namespace>/<node>[/<name>/<type>/<hash>/<qos>[/backends:<list>]]``, every ``/`` inside a field written
+``%``. Of topics with buffer fields (images, point clouds) tokens name the backends that their node takes (0.10.5, so
+Lyrical and Rolling). A publisher puts beside the key then: to ``<key>/_buf_cpu`` for all who take ``cpu`` alone, to
+``<key>/_buf/<gid>`` what one other one shares its memory for. Subscriptions take the key itself, too.
 ros2dds:    data ``<name>``; token ``@/<zid>/@ros2_lv/<kind>/<name>/<type>[/<qos>]``, every ``/`` inside written ``§``.
 
-Sources: rmw_zenoh's design document (key expressions, graph cache, publishers), the liveliness module of
-zenoh-plugin-ros2dds 1.x; REP 2016 for type hashes. Read, not copied.
+Sources: rmw_zenoh's design document (key expressions, graph cache, publishers), its publisher, subscription and buffer
+endpoint sources; the liveliness module of zenoh-plugin-ros2dds 1.x; REP 2016 for type hashes. Read, not copied.
 """
 
 from __future__ import annotations
@@ -28,9 +31,12 @@ DOMAIN: Final = "ROS_DOMAIN_ID"
 """The environment variable by which a ROS 2 node chooses its domain."""
 MAX_DOMAIN: Final = 232
 """Largest ROS_DOMAIN_ID that ROS 2 allows anywhere."""
+BUFFERS: Final = "/_buf_cpu"
 TRANSIENT_LOCAL: Final = 1
 """rmw's number of that durability in a token's QoS."""
 
+_BACKENDS: Final = "backends:"
+_BY_CPU: Final = f"/{_BACKENDS}cpu:"
 _PLACEHOLDER: Final = re.compile(r"\{[a-z]+\}")
 _TOKEN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TYPE: Final = re.compile(
@@ -93,7 +99,8 @@ class Endpoint(Struct, frozen=True, kw_only=True):
     type_name: str = ""
     """ros2dds only (rmw_zenoh has it in the key)."""
     qos: str = ""
-    """As the token writes it; empty: the token has none (services of ros2dds)."""
+    """As the token writes it; empty: the token has none (services of ros2dds). With `_BY_CPU` where it names backends:
+    memory is not shared with another machine."""
 
 
 # --- names ----------------------------------------------------------------------------------------------------------
@@ -194,6 +201,11 @@ def is_rmw_key(expr: str) -> bool:
     return _RMW_KEY.fullmatch(expr) is not None
 
 
+def has_buffers_beside(graph: RosGraph, expr: str) -> bool:
+    """True when samples of ``expr`` may also come under the same key and `BUFFERS` behind it."""
+    return graph is RosGraph.RMW_ZENOH and is_rmw_key(expr) and not expr.endswith("**")
+
+
 # --- graph tokens ---------------------------------------------------------------------------------------------------
 
 
@@ -205,14 +217,15 @@ def token_selector(graph: RosGraph) -> str:
 def parse_token(token: str) -> tuple[str, Endpoint] | None:
     """(zenoh id of the announcing session, endpoint) of a graph token; ``None`` for nodes and for anything else."""
     chunks = token.split("/")
-    if chunks[0] == "@ros2_lv" and len(chunks) == 13:
-        domain, zid, kind, (name, type_name, type_hash, qos) = chunks[1], chunks[2], chunks[5], chunks[9:]
+    if chunks[0] == "@ros2_lv" and len(chunks) >= 13:
+        domain, zid, kind, (name, type_name, type_hash, qos, *more) = chunks[1], chunks[2], chunks[5], chunks[9:]
         topic = name.replace("%", "/").strip("/")
+        qos += _BY_CPU if any(one.startswith(_BACKENDS) for one in more) else ""
         key = f"{domain}/{topic}/{type_name.replace('%', '/')}/{type_hash}"
         return (zid, Endpoint(kind=EndpointKind(kind), key=key, qos=qos)) if kind in _KINDS and topic else None
-    if len(chunks) in (6, 7) and chunks[0] == "@" and chunks[2] == "@ros2_lv" and chunks[3] in _KINDS:
+    if len(chunks) >= 6 and chunks[0] == "@" and chunks[2] == "@ros2_lv" and chunks[3] in _KINDS:
         key, type_name = chunks[4].replace("§", "/"), chunks[5].replace("§", "/")
-        qos = chunks[6] if len(chunks) == 7 else ""
+        qos = "".join(chunks[6:7])
         return chunks[1], Endpoint(kind=EndpointKind(chunks[3]), key=key, type_name=type_name, qos=qos)
     return None
 
@@ -290,7 +303,7 @@ def encode_attachment(value: Attachment) -> bytes:
 
 def decode_attachment(raw: bytes) -> Attachment | None:
     """The attachment that ``raw`` is; ``None`` when it is none."""
-    if len(raw) != _BYTES or raw[16] != GID_BYTES:
+    if len(raw) < _BYTES or raw[16] != GID_BYTES:
         return None
     sequence, stamp_ns = (int.from_bytes(part, "little", signed=True) for part in (raw[:8], raw[8:16]))
-    return Attachment(sequence=sequence, stamp_ns=stamp_ns, gid=raw[17:])
+    return Attachment(sequence=sequence, stamp_ns=stamp_ns, gid=raw[17:_BYTES])

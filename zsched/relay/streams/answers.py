@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from typing import Final, cast
+from typing import Final
 
 import zenoh
-from zenoh import Priority, Sample, SampleKind
+from zenoh import Sample
 
 from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import serial_of
@@ -26,6 +26,7 @@ from zsched.hop.acknowledger import Acknowledger
 from zsched.hop.weight import weight
 from zsched.ipc.pipe import decode_end
 from zsched.relay.streams.counter import StreamCounter
+from zsched.relay.streams.given import under
 
 MAX_WAITING: Final = 4096
 MAX_WAITING_BYTES: Final = 32 << 20
@@ -34,20 +35,6 @@ MAX_EARLY: Final = 4096
 """Publishers of which answers wait..."""
 MAX_EARLY_BYTES: Final = 2 * MAX_WAITING_BYTES
 """...and what they may weigh together: anybody can put under a name of his own what is early for ever."""
-
-
-class _Resent(Struct, frozen=True):
-    """What the relay reads of a sample, under the key that it was first sent on (zenoh lets nobody make a sample)."""
-
-    key_expr: str
-    payload: zenoh.ZBytes
-    encoding: zenoh.Encoding
-    attachment: zenoh.ZBytes | None
-    timestamp: zenoh.Timestamp | None
-    priority: Priority
-    express: bool
-    source_info: zenoh.SourceInfo
-    kind: SampleKind
 
 
 class _Total(Struct, eq=False):
@@ -152,18 +139,7 @@ class Answers:
             marker = decode_end(sample.payload.to_bytes())
             ready = () if marker is None else self._begin_later(name, marker)
         else:
-            resent = _Resent(
-                key_expr=key,
-                payload=sample.payload,
-                encoding=sample.encoding,
-                attachment=sample.attachment,
-                timestamp=sample.timestamp,
-                priority=sample.priority,
-                express=sample.express,
-                source_info=info,
-                kind=sample.kind,
-            )
-            ready = self.take(name, info.source_sn, cast("Sample", resent), is_again=True)
+            ready = self.take(name, info.source_sn, under(key, sample), is_again=True)
         return tuple((name, one) for one in ready)
 
     def ended(self, name: SourceName) -> None:

@@ -23,8 +23,10 @@ import zenoh
 from zenoh import Sample, Session
 
 from zsched.clock import awake_s
+from zsched.core.route.ros2 import BUFFERS, has_buffers_beside
 from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.guard import guarded, tolerant
+from zsched.relay.streams.given import under
 from zsched.relay.streams.history import HeldValues
 
 JOIN_S: Final = 0.3
@@ -89,15 +91,28 @@ class Receiver:
             # zenoh's own thread sleeps until a sample comes; one that waits at a handler wakes up ten times a second
             take = zenoh.handlers.Callback(tolerant(self._carry, "from"), self._ended.set)
             self._subscriber = session.declare_subscriber(expr, take, allowed_origin=origin)
-        if self._history is not None:
-            try:
+        self._beside: Receiver | None = None
+        try:
+            if self._history is not None:
                 self._history.start()
-            except RuntimeError:
-                self.close()
-                raise
+            if has_buffers_beside(settings.graph, expr):
+                self._beside = Receiver(
+                    session,
+                    expr + BUFFERS,
+                    settings,
+                    lambda sample: self._carry(under(str(sample.key_expr).removesuffix(BUFFERS), sample)),
+                    with_history=False,
+                    give_way=give_way,
+                    origin=origin,
+                )
+        except RuntimeError:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Unsubscribe; the thread ends behind what it has in hand."""
+        if self._beside is not None:
+            self._beside.close()
         undeclare(self._subscriber)
         if self._history is not None:
             self._history.close()
@@ -106,6 +121,8 @@ class Receiver:
     def wait(self) -> None:
         """Behind `close`, when nothing holds up ``carry`` any more: wait until the last sample has been given to it."""
         self._ended.wait(REST_S)
+        if self._beside is not None:
+            self._beside.wait()
 
     def _drain(self, subscriber: _Subscriber, expr: str, settings: StreamSettings) -> None:
         """Start a thread of our own for what zenoh's queue holds."""

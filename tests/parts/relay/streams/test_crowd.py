@@ -16,11 +16,11 @@ from support.waiting import free_endpoint, until
 from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.relay.streams import crowd
 from zsched.relay.streams.crowd import FITS_BYTES, MAX_REST_S, REST_S, Crowd, Reader, note_feeder
+from zsched.relay.streams.given import Given
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outlet import Outlet
 from zsched.sessions.config import client_config, data_config
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets
-from zsched.stream.samples import Given
 
 NOW = 100.0
 

@@ -17,7 +17,7 @@ from support.sessions import hub_and_neighbour, matches
 from support.waiting import between, free_endpoint, until
 from zsched.core.hop.books import unaccounted
 from zsched.core.relay_protocol import EndMarker
-from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
+from zsched.core.values.plan import Direction, HandoverRule, RosGraph, Route, StreamClass, StreamSettings
 from zsched.ipc.pipe import decode_end, encode_end
 from zsched.relay.streams import fence as fences
 from zsched.relay.streams import inputs, outlet, outputs, receive, slots
@@ -160,6 +160,33 @@ def test_kept_values_warm_up_a_slot_key_by_key(bench: Bench) -> None:
     until(lambda: got[-1] == ("edge1/t/a/map", "a3"), "only that one again")
     assert stream.count().replayed == 5
     kept.undeclare()
+
+
+@pytest.mark.parametrize("stream_class", [StreamClass.BEST_EFFORT, StreamClass.LATEST])
+def test_images_are_taken_beside_their_topics_key_and_given_under_it(bench: Bench, stream_class: StreamClass) -> None:
+    """rmw_zenoh's publishers of topics with buffer fields put there for who takes `cpu`; all take the key itself."""
+    image = "sensor_msgs::msg::dds_::Image_/RIHS01_x"
+    heard: list[str] = []
+    kept = bench.outside.declare_subscriber("0/edge1/**", lambda sample: heard.append(str(sample.key_expr)))
+    back = bench.outside.declare_subscriber("0/seen/**", lambda sample: heard.append(str(sample.key_expr)))
+    settings = replace(way_in(stream_class).settings, graph=RosGraph.RMW_ZENOH)
+    route = replace(way_in(stream_class), from_expr="0/cam/*/*", to_expr="0/edge1/cam/*/*", settings=settings)
+    bench.flowing(route)
+    for ending in ("", "/_buf_cpu"):
+        bench.publisher(f"0/cam/{image}{ending}", congestion_control=zenoh.CongestionControl.BLOCK).put("image")
+    until(lambda: heard == [f"0/edge1/cam/{image}"] * 2, "both")
+    heard.clear()
+    out = replace(
+        route, direction=Direction.OUTPUT, stream="t/out/0", from_expr="0/edge2/seen/*/*", to_expr="0/seen/*/*"
+    )
+    stream = bench.output(out)
+    stream.open(1, out)
+    stream.flip(1, drops_held=False)
+    for ending in ("", "/_buf_cpu"):
+        bench.publisher(f"0/edge2/seen/{image}{ending}", congestion_control=zenoh.CongestionControl.BLOCK).put("image")
+    until(lambda: heard == [f"0/seen/{image}"] * 2, "both")
+    kept.undeclare()
+    back.undeclare()
 
 
 def test_of_many_keys_those_give_way_that_have_rested_longest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

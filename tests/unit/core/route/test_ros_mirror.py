@@ -39,6 +39,15 @@ def test_a_publisher_is_shown_forwards_and_a_subscription_backwards() -> None:
     )
 
 
+def test_a_lazy_camera_sees_one_subscription_that_takes_what_crosses_machines() -> None:
+    by_cpu = "2::,5:,:,:,,/backends:cpu:"
+    camera, detector = one(MP, "robot1/map", by_cpu), one(MS, "edge1/m/robot1/map", by_cpu)
+    seen = Sides(local=frozenset({camera}), fleet=frozenset({detector}))
+    assert mirrored([INPUT], seen).local == {one(MS, "robot1/map", by_cpu)}
+    plain = route(Direction.INPUT, "0/robot1/map/*/*", "edge1/m/robot1/map")
+    assert mirrored([plain], seen).local == {one(MS, "robot1/map", by_cpu)}, "the relay stands in for a plain worker"
+
+
 def test_an_output_goes_the_other_way() -> None:
     seen = Sides(local=frozenset({one(MS, "robot1/merged")}), fleet=frozenset({one(MP, "edge1/m/map")}))
     assert mirrored([OUTPUT], seen) == Sides(
