@@ -12,10 +12,10 @@ from support.slices import slices
 from zsched.config.timing import WAN
 from zsched.core import events as ev
 from zsched.core.electorate.documents import Documents
-from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, TuneTask
 from zsched.core.values.model import Asked
+from zsched.core.values.words import CREATION_STEP
 from zsched_lab.sim import fleets
 
 

@@ -20,8 +20,8 @@ from zsched.commands.history import age_s_of, is_known, is_move, wall_text, when
 from zsched.commands.page import Cell, Page, memory, name_room, short_name, span
 from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
-from zsched.core.values.struct import Struct
-from zsched.core.values.words import PAPER_METRICS
+from zsched.core.values.struct import Struct, replace
+from zsched.core.values.words import PAPER_METRICS, meant, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 SCHEMA = "zsched.explain/1"
@@ -130,7 +130,7 @@ class Point(Struct, frozen=True, kw_only=True):
     def told(self) -> str:
         """Which judgements it means, in words."""
         if self.epoch is not None:
-            return f"before epoch {self.epoch}"
+            return f"before epoch {shown(self.epoch)}"
         return f"until {self.word}" if self.age_s is None else f"of {self.word} ago or before"
 
 
@@ -162,6 +162,8 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Json]:
     if door.node is not None or door.endpoint:
         raise CliError(EXIT_USAGE, "--at reads the decision log, which lies on each robot: run it there")
     answer = _ask(door, task)  # names an unknown task
+    if point.epoch is not None:
+        point = replace(point, epoch=meant(point.epoch, answer["explanation"]["allocation"]["epoch"]))
     node, now, entry, move = _search(door, task, point)
     if entry is None:
         is_edge = answer["explanation"]["kind"] == "edge"
@@ -204,14 +206,13 @@ def _search(door: Door, task: str, point: Point) -> tuple[str, float, Json | Non
         if not answer["more"]:
             break
     if point.epoch is not None and move is None:
-        raise CliError(
-            EXIT_FAILED, f"the log of {answer['node']} has no move of {task} to epoch {point.epoch}{_known(epochs)}"
-        )
+        told = f"has no move of {task} to epoch {shown(point.epoch)}{_known(epochs)}"
+        raise CliError(EXIT_FAILED, f"the log of {answer['node']} {told}")
     return str(answer["node"]), float(answer["now"]), judgement, move
 
 
 def _known(epochs: Sequence[int]) -> str:
-    return f"; it knows epochs {min(epochs)} to {max(epochs)}" if epochs else "; it knows no move of it"
+    return f"; it knows epochs {shown(min(epochs))} to {shown(max(epochs))}" if epochs else "; it knows no move of it"
 
 
 # --- the judgement of now --------------------------------------------------------------------------------------------
@@ -290,10 +291,10 @@ def _judgement(page: Page, title: str, body: Json) -> None:
     parts: list[Cell] = [
         (f"{body['outcome']}{chosen}", OUTCOMES.get(body["outcome"], "yellow")),
         (body["reason"], ""),
-        (f"owner {body['owner'] or 'nobody'}, epoch {body['epoch']}, revision {body['revision']}", "dim"),
+        (f"owner {body['owner'] or 'nobody'}, epoch {shown(body['epoch'])}, revision {shown(body['revision'])}", "dim"),
     ]
     if body.get("newest_revision", body["revision"]) != body["revision"]:
-        parts.append((f"the value has changed since: revision {body['newest_revision']}", "yellow"))
+        parts.append((f"the value has changed since: revision {shown(body['newest_revision'])}", "yellow"))
     page.block(title, *parts)
 
 
@@ -305,7 +306,7 @@ def _made(page: Page, body: Json) -> None:
     votes = ", ".join(f"{voter} for {choice}" for voter, choice in move["votes"].items())
     page.block(
         "THEN",
-        (f"{where_of(move)}, epoch {move['epoch']}", "bold"),
+        (f"{where_of(move)}, epoch {shown(move['epoch'])}", "bold"),
         (move["reason"], ""),
         (votes or "no votes heard", "" if votes else "dim"),
         (f"{span(move['age_s'])} ago ({move['at']})", "dim"),
@@ -415,7 +416,7 @@ def _vote(page: Page, body: Json) -> None:
         "VOTE",
         (f"{vote['outcome'].replace('_', ' ')}{won}", ""),
         (votes or "no proposals", ""),
-        (f"on revision {vote['base_revision']}", "dim"),
+        (f"on revision {shown(vote['base_revision'])}", "dim"),
         (f"{span(vote['age_s'])} ago", "dim"),
     )
 

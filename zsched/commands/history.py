@@ -18,6 +18,7 @@ from zsched.commands.common import Away, CliError, Json, nearest, print_json, sa
 from zsched.commands.page import span
 from zsched.commands.report import millis, printable
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA = "zsched.history/1"
@@ -315,7 +316,7 @@ def _move_line(move: Json) -> str:
     votes = "; ".join(f"{', '.join(voters)} for {choice}" for choice, voters in camps.items())
     switched = "" if move["switched_s"] is None else f", streams switched in {millis(move['switched_s'])}"
     switched += "" if move["gap_s"] is None else f", answers {millis(move['gap_s'])} apart"
-    head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {move['epoch']}  {where_of(move)}"
+    head = f"{span(move['age_s']):>6} ago  {move['at']}  {move['task']} epoch {shown(move['epoch'])}  {where_of(move)}"
     return f"{head}: {move['reason']}{f' ({votes})' if votes else ''}{switched}"
 
 
@@ -331,9 +332,9 @@ def _print(entries: list[Json], view: EventsView) -> None:
         if view.is_json:
             print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
             continue
-        shown = printable(entry)
-        where = f"task={shown['task']} epoch={shown.get('epoch', 0)} " if shown.get("task") else ""
-        say(f"{wall_text(entry['at'])} {shown['stage']:<10} {where}{shown['text']}", indent=4)
+        told = printable(entry)
+        where = f"task={told['task']} epoch={shown(told.get('epoch', 0))} " if told.get("task") else ""
+        say(f"{wall_text(entry['at'])} {told['stage']:<10} {where}{told['text']}", indent=4)
 
 
 def _is_of(entry: Json, types: Container[str]) -> bool:

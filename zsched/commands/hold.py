@@ -28,6 +28,7 @@ from zsched.commands.orders import (
 from zsched.commands.page import span
 from zsched.commands.report import told_hold
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import meant, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 TASK_SCHEMA: Final = "zsched.task/1"
@@ -136,7 +137,7 @@ def _not_known(door: Door, revisions: Mapping[str, int]) -> list[str]:
             continue
         known = {str(task["name"]): int(task["revision"]) for task in status["tasks"]}
         late = [name for name, revision in revisions.items() if known.get(name, -1) < revision]
-        lacks += [f"{node} has not learnt revision {revisions[name]} of {name}" for name in late]
+        lacks += [f"{node} has not learnt revision {shown(revisions[name])} of {name}" for name in late]
     return lacks
 
 
@@ -173,7 +174,7 @@ def _give_hold(view: OrderView, order: HoldOrder, task: Json) -> Json:
         "target": order.node,
         "hard": order.is_hard,
         "for_s": view.for_s,
-        "base_revision": task["revision"] if view.revision is None else view.revision,
+        "base_revision": meant(view.revision, task["revision"]),
         **view.asked,
         "reason": _reason(view, order, task),
     }

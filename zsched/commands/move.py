@@ -29,6 +29,7 @@ from zsched.commands.page import span
 from zsched.commands.report import millis
 from zsched.commands.wait import Condition, missing
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import meant, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 
 MOVE_SCHEMA: Final = "zsched.move/1"
@@ -65,7 +66,7 @@ def move(view: OrderView, order: MoveOrder) -> int:
         "task": order.task,
         "target": order.node,
         "origin": order.origin,
-        "base_revision": task["revision"] if view.revision is None else view.revision,
+        "base_revision": meant(view.revision, task["revision"]),
         **view.asked,
     }
     plan = ask_door(view.door, {**request, "plan": True})
@@ -134,9 +135,9 @@ def _look(door: Door, order: MoveOrder, revision: int) -> _End:
     lacks = missing(Condition(kind="settled", task=order.task), {str(first["node"]): first, **found})
     task = told_task(first, order.task)
     if task and task["revision"] < revision:
-        lacks.append(f"{order.task}: {first['node']} has not learnt revision {revision}")
+        lacks.append(f"{order.task}: {first['node']} has not learnt revision {shown(revision)}")
     elif task and task["owner"] != order.node:
-        owner = f"{task['owner'] or 'nobody'} owns it (epoch {task['epoch']})"
+        owner = f"{task['owner'] or 'nobody'} owns it (epoch {shown(task['epoch'])})"
         return _End(found, [f"{order.task}: {owner}; `zsched history` tells why"], has_left=True)
     return _End(found, [*lacks, *silent.values()])
 
@@ -190,7 +191,7 @@ def _tell_move(
             say(f"  {lack}", indent=4)
         say("the move stands; `zsched status` on such a node names what it waits for")
     elif not found:
-        say(f"{order.task}: revision {result['revision']} is agreed; `zsched wait --for settled={order.task}`")
+        say(f"{order.task}: revision {shown(result['revision'])} is agreed; `zsched wait --for settled={order.task}`")
     else:
         took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
         took += "" if gap_s is None else f", answers at most {millis(gap_s)} apart"

@@ -20,7 +20,7 @@ from zsched.commands.document import ask_all
 from zsched.commands.page import span
 from zsched.core.values.model import MAX_FOR_S
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import MAX_ASKER
+from zsched.core.values.words import MAX_ASKER, shown
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.screen import harmless
 
@@ -224,5 +224,5 @@ def tell_results(results: Mapping[str, Json]) -> int:
             raise refused(name, result)
         word = "agreed" if result["outcome"] == "ok" else str(refused(name, result)).removeprefix(f"{name}: ")
         revision = result["revision"]  # none is told of an order of which nobody knows what has become
-        say(f"{name}: {word}{'' if revision is None else f' (revision {revision})'}")
+        say(f"{name}: {word}{'' if revision is None else f' (revision {shown(revision)})'}")
     return max(codes)

@@ -23,7 +23,7 @@ from zsched.core.values.electorate import SAID_DIGITS, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, RegisterState
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import MAX_ASKER
+from zsched.core.values.words import MAX_ASKER, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime import recovery as runtime
 
@@ -163,10 +163,7 @@ def _table(plan: Recovery, draft: DurableState) -> str:
         rows.append(("document", old, f"this machine's file, {after.document[:SAID_DIGITS]}"))
     held = {state.task: state for state in draft.registers}
     olds = _epochs(plan)
-    rows += [
-        (f"task {one.task}", olds.get(one.task, "no value"), _begins(held.get(one.task), one.start))
-        for one in after.tasks
-    ]
+    rows += [(f"task {one.task}", olds.get(one.task, "no value"), _begins(held.get(one.task))) for one in after.tasks]
     wide = max(len(what) for what, _, _ in rows)
     return "\n".join([f"{after.fleet}:", *(f"  {what:{wide}}  {old} -> {new}" for what, old, new in rows)])
 
@@ -179,15 +176,13 @@ def _epochs(plan: Recovery) -> dict[str, str]:
             held = None if register.accepted is None else register.accepted.value
             for value in (held, register.learnt):
                 if value is not None and value.revision >= found.get(register.task, (0, ""))[0]:
-                    told = f"{value.owner or 'nobody'}, epoch {value.epoch} (state of {state.node})"
+                    told = f"{value.owner or 'nobody'}, epoch {shown(value.epoch)} (state of {state.node})"
                     found[register.task] = value.revision, told
     return {task: told for task, (_, told) in found.items()}
 
 
-def _begins(state: RegisterState | None, start: int) -> str:
-    if state is None or state.learnt is None:
-        return f"nobody, epoch {start}"
-    return f"{state.learnt.owner or 'nobody'}, epoch {state.learnt.epoch}"
+def _begins(state: RegisterState | None) -> str:
+    return (state and state.learnt and state.learnt.owner) or "nobody"
 
 
 def _next(plan: Recovery, value: FleetValue) -> str:

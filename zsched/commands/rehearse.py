@@ -28,7 +28,7 @@ from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
 from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
 from zsched.core.values.struct import Struct, field, replace
-from zsched.core.values.words import MAX_ASKED
+from zsched.core.values.words import MAX_ASKED, meant, shown
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 from zsched.screen import screen_width
 from zsched.wire.codec import from_plain
@@ -300,8 +300,8 @@ class Stage:
             ready=frozenset(_ready(self.first, order.task)),
             owner=str(task["owner"] or ""),
         )
-        if view.revision is not None and view.revision != task["revision"]:
-            now = f"{order.task} has revision {task['revision']}"
+        if meant(view.revision, task["revision"]) != task["revision"]:
+            now = f"{order.task} has revision {shown(task['revision'])}"
             raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {now}")
         self._drains = replace(
             view, revision=None, reason=str(self.asked["reason"]), for_s=order.limit_s + DRAIN_MORE_S

@@ -31,6 +31,7 @@ from zsched.core.values.words import (
     RESTARTING,
     WAS_READY,
     has_lost_its_worker,
+    shown,
     told_of_worker,
 )
 
@@ -314,7 +315,7 @@ def _task(page: Page, status: Json, task: Json) -> None:
         since_s = task["since_s"]
         known = [] if since_s is None else [(f"known here for {span(since_s)}{page.since(since_s)}", "")]
         parts = [(f"{owner} owns it", "bold"), *known, (state, STATE_STYLES.get(state, "red"))]
-    counts = [(f"epoch {task['epoch']}", ""), (f"revision {task['revision']}", "")]
+    counts = [(f"epoch {shown(task['epoch'])}", ""), (f"revision {shown(task['revision'])}", "")]
     pin = task.get("pin")  # a later field of the schema's major version
     held = [] if pin is None else [(f"pinned to {told_hold('pin', pin)}", "yellow")]
     rollout = task.get("rollout")
@@ -524,12 +525,12 @@ def _vote(page: Page, task: Json, *, has_quorum: bool) -> None:
             "VOTE",
             (f"{vote['outcome'].replace('_', ' ')}{winner}{so_far}", "green" if is_won and is_agreed else "yellow"),
             *((f"{choice}: {', '.join(voters)}", "") for choice, voters in camps.items()),
-            (f"on revision {vote['base_revision']}", "dim"),
+            (f"on revision {shown(vote['base_revision'])}", "dim"),
             (f"{span(vote['age_s'])} ago{page.moment(vote['age_s'])}", "dim"),
         )
     for past in reversed(task["history"][-MAX_HISTORY:]):
         ago = f"{span(past['age_s']):>6} ago{page.moment(past['age_s'])}"
-        what = f"{ago}  epoch {past['epoch']}  {past['owner'] or 'nobody'}: {past['reason']}"
+        what = f"{ago}  epoch {shown(past['epoch'])}  {past['owner'] or 'nobody'}: {past['reason']}"
         page.lines.append(" " * page.indent + page.paint(cut(what, page.width - page.indent), "dim"))
 
 

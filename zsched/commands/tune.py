@@ -18,6 +18,7 @@ from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_f
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, default_patience
 from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
 from zsched.core.values.struct import replace
+from zsched.core.values.words import meant, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 TUNING_SCHEMA: Final = "zsched.tuning/1"
@@ -121,7 +122,7 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     code = begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
     if code is not None:
         return code
-    base = task["revision"] if view.revision is None else view.revision
+    base = meant(view.revision, task["revision"])
     request = {"verb": "tune", "task": name, "tuning": tuning, "base_revision": base, **view.asked}
     result = ask_door(view.door, request)
     if view.is_json:
@@ -221,7 +222,7 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
             for key in KEYS
             if key in now or key in file
         ]
-        say(f"{task['name']} (revision {task['revision']}): {' '.join(words)}")
+        say(f"{task['name']} (revision {shown(task['revision'])}): {' '.join(words)}")
     return EXIT_OK
 
 

@@ -48,6 +48,7 @@ from zsched.core.values.words import (
     RESTARTING,
     TAKEN_OUT,
     WAS_READY,
+    shown,
     told_of_worker,
 )
 from zsched.core.vote.generations import way_out
@@ -678,6 +679,6 @@ def status_line(node: Stages) -> str:
     states = node.membership.states()
     alive = sum(state is PeerState.ALIVE for state in states.values())
     values = [register.value for register in node.registers.values()]
-    tasks = " · ".join(f"{value.task}@{value.owner or 'nobody'} epoch {value.epoch}" for value in values)
+    tasks = " · ".join(f"{value.task}@{value.owner or 'nobody'} epoch {shown(value.epoch)}" for value in values)
     quorum = "" if _quorum(node).ok else " · NO QUORUM"
     return f"{node.kind} {node.me} · {alive}/{len(states)} nodes · {tasks}{quorum}"

@@ -17,6 +17,7 @@ from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Standby
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct, field
+from zsched.core.values.words import shown
 from zsched.dev.nodes import Json, Nodes
 from zsched.dev.terminal import Keys
 from zsched.dev.watch import Watched
@@ -221,7 +222,7 @@ class Run:
         self._owners[name] = now
         reason = next((past["reason"] for past in task["history"] if past["epoch"] == now[1]), "")
         where = f"{before[0]} -> {now[0]}" if before else f"on {now[0]}"
-        self._say(f"{name}: {where} (epoch {now[1]}{': ' if reason else ''}{reason})")
+        self._say(f"{name}: {where} (epoch {shown(now[1])}{': ' if reason else ''}{reason})")
 
     def _tell_worker(self, node: NodeId, task: TaskId, state: str) -> None:
         known = (node, task) in self._failed

@@ -14,6 +14,7 @@ from typing import Final, TypeVar
 from zsched.adapters.network.node_ping import LARGE_S, SIZES, ping
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, fleet_hash
 from zsched.core.values.struct import replace
+from zsched.core.values.words import shown
 from zsched.doctor.daemon import judged_lag, lacks_of_owners, problems_of
 from zsched.doctor.model import (
     OTHER_ELECTORS,
@@ -184,7 +185,7 @@ def _register(task: str, statuses: Mapping[str, Json]) -> Iterator[Result]:
         return
     newest = max(values)
     told = [
-        f"{task}: revision {revision}, epoch {epoch}, owner {owner}, hash {rest} on {', '.join(names)}"
+        f"{task}: revision {shown(revision)}, epoch {shown(epoch)}, owner {owner}, hash {rest} on {', '.join(names)}"
         for (revision, epoch, owner, rest), names in sorted(values.items(), reverse=True)
     ]
     if any(value[0] == newest[0] and value != newest for value in values):

@@ -45,6 +45,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.rehearsal import KeepRehearsal, RehearsalsTold
 from zsched.core.values.struct import replace
+from zsched.core.values.words import shown
 from zsched.errors import AdapterError, WireError
 from zsched.runtime.crew import Crew
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk
@@ -346,7 +347,7 @@ class Shell:
         self._inbox.post(shown)
 
     def _tell(self, story: do.RecordStory) -> None:
-        where = f"task={story.task} epoch={story.epoch} " if story.task else ""
+        where = f"task={story.task} epoch={shown(story.epoch)} " if story.task else ""
         _stages[story.stage].info("%s%s", where, story.text)
         if self.log is not None:
             self.log.put(story)

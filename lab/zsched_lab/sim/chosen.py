@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from zsched.core.values.electorate import CREATION_STEP, Elector, FleetValue
+from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.messages import Accept, Prepare
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeId, RegisterState
 from zsched.core.values.quorum import majority
+from zsched.core.values.words import CREATION_STEP
 
 Name = tuple[str, str, int]
 """(generation, register, creation); the fleet register's creation is -1."""

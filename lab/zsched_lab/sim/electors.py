@@ -18,10 +18,11 @@ from zsched.core.instructions import AskElectors, AskFleet, SendAccept, SendPrep
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner, Rewrite, RoundOutcome
-from zsched.core.values.electorate import CREATION_STEP, Creation, Elector, FleetValue
+from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId, Tuning, Weights
 from zsched.core.values.struct import replace
+from zsched.core.values.words import CREATION_STEP
 from zsched_lab.sim.chosen import Chosen
 
 BALLOT_S: Final = 0.3

@@ -20,6 +20,7 @@ from zsched.commands.common import CliError
 from zsched.commands.orders import user_name
 from zsched.commands.report import render_status
 from zsched.commands.tune import KEYS, tuned
+from zsched.core.values.words import CREATION_STEP
 
 TUNING: Json = {
     "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
@@ -439,6 +440,19 @@ def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> N
     assert (faults(body), len(body["tasks"])) == ([], 2)
     body = json.loads(run("tune", "echo", "bonus=null", "--yes", "--json").stdout)
     assert (faults(body), body["tasks"][0]["tuning"]["bonus"]) == ([], 0.1)
+
+
+def test_epochs_and_revisions_are_counted_from_1_for_people_and_typed_back(daemon: Daemon) -> None:
+    first = daemon.status["tasks"][0]
+    first |= {"revision": CREATION_STEP + 7, "epoch": CREATION_STEP + 2}
+    told = render_status(daemon.status, 100, color=False)
+    assert ("epoch 2 " in told, "revision 7" in told, str(CREATION_STEP)[:6] in told) == (True, True, False)
+    assert "(revision 7)" in run("tune", "echo").stdout
+    for said in ("7", str(CREATION_STEP + 7), "6"):
+        result = run("tune", "echo", f"bonus=0.{said[0]}", "--revision", said, "--yes")
+        assert result.stdout.splitlines()[-1].startswith("echo: agreed (revision "), result.output
+    assert [one["base_revision"] - CREATION_STEP for one in daemon.orders] == [7, 7, 6]
+    assert json.loads(run("tune", "echo", "--json").stdout)["tasks"][0]["revision"] > CREATION_STEP
 
 
 OWN: Json = {

@@ -32,7 +32,6 @@ from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import StreamRule, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
@@ -53,6 +52,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
 from zsched.core.values.profile import Echo, WorkerState
+from zsched.core.values.words import CREATION_STEP
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")

@@ -12,8 +12,8 @@ from typing import Final
 from zsched.commands.common import Json
 from zsched.commands.history import moves_of, wall_text
 from zsched.commands.watch.feed import News
-from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import CREATION_STEP
 from zsched.exits import EXIT_OK
 
 POINTS: Final = 900

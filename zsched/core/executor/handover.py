@@ -45,6 +45,7 @@ from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
 from zsched.core.values.model import Allocation, NodeId, NodeKind
 from zsched.core.values.plan import DrainingSlot, Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
 from zsched.core.values.struct import Struct, replace
+from zsched.core.values.words import shown
 
 ROLE_DRAIN_MARGIN_S = 1.0
 """The old owner's worker goes idle this much after the robots' drain time (a cold standby's start comes on top).
@@ -524,7 +525,7 @@ class Executor:
             self._close(why, todo)
             return
         plan = RoutePhase.PREPARE if self.phase is Phase.PREPARING else RoutePhase.FLIP
-        epochs = ", ".join(str(old.slot.epoch) for old in dropped)
+        epochs = ", ".join(str(shown(old.slot.epoch)) for old in dropped)
         self._go(self.phase, plan, f"drops the slot of epoch {epochs}: {why}", todo)
 
     def _forget(self, gone: tuple[_Old, ...]) -> bool:

@@ -28,6 +28,7 @@ from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.struct import Struct, field
+from zsched.core.values.words import shown
 
 ASK_EVERY_S = 0.2
 """An owner that waits for unleased workers asks their nodes at most this often."""
@@ -141,7 +142,7 @@ class Sealing(Struct):
         if spec.name in answer.unleased:
             return "works without a lease"
         epoch = next((known.epoch for known in answer.values if known.task == spec.name), 0)
-        return "" if epoch >= value.epoch else f"has not learnt epoch {value.epoch}"
+        return "" if epoch >= value.epoch else f"has not learnt epoch {shown(value.epoch)}"
 
     def problem(self, spec: TaskSpec, value: Allocation, now: float) -> str:
         """How this node's file and the agreed value differ at ``now``; empty when they do not."""

@@ -22,9 +22,9 @@ from zsched.core.handlers.work import carry_out
 from zsched.core.stages import HISTORY, OWN_FILE, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
-from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeKind, TaskId
+from zsched.core.values.words import CREATION_STEP
 
 SOURCE: Final = "fleet"
 """Of the problem that a file cannot be taken over."""

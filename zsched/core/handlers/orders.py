@@ -20,6 +20,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, SetHold
 from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, MoveTask, TuneTask
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId, told_by
+from zsched.core.values.words import shown
 
 Refusal = tuple[CommandOutcome, str]
 _SO_ALREADY: Final = "it is so already"
@@ -163,7 +164,7 @@ def _refused(node: Stages, task: TaskId, base_revision: int | None) -> Refusal |
         return CommandOutcome.INVALID, f"no task {task!r}; tasks: {', '.join(sorted(node.registers))}"
     revision = node.registers[task].value.revision
     if base_revision not in (None, revision):
-        return CommandOutcome.CONFLICT, f"revision is {revision}, not {base_revision}"
+        return CommandOutcome.CONFLICT, f"revision is {shown(revision)}, not {shown(base_revision)}"
     return None
 
 

@@ -15,11 +15,10 @@ from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import UNREADY_SHOWN_S, Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
-from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import WorkerState
-from zsched.core.values.words import HAS_RESTED, TOO_FEW_ELECTORS
+from zsched.core.values.words import CREATION_STEP, HAS_RESTED, TOO_FEW_ELECTORS, shown
 
 FIRST_NEWS: Final = "known from a peer, the first news here"
 """Why a task has its owner, at a node that knew nothing of the task."""
@@ -55,7 +54,7 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     node.expiry.note(value, now)
     node.votes.on_learnt(task)
     node.rounds.on_learnt(task, is_new_epoch=is_new_epoch, now=now, tuning=value.tuning)
-    text = f"learnt revision {value.revision}: owner {value.owner}, weights {_told(value.tuning.weights)}"
+    text = f"learnt revision {shown(value.revision)}: owner {value.owner}, weights {_told(value.tuning.weights)}"
     text += "" if value.asked is None and not is_known else f", {reason}"
     by = "" if value.asked is None or is_known else value.asked.by
     todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch, move=move, by=by))

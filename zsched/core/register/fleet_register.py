@@ -12,8 +12,9 @@ from zsched.core.instructions import AskElectors
 from zsched.core.register.register import Register
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
-from zsched.core.values.electorate import CREATION_STEP, Electorate, FleetValue
+from zsched.core.values.electorate import Electorate, FleetValue
 from zsched.core.values.messages import Accept, Prepare
+from zsched.core.values.words import CREATION_STEP
 
 
 class FleetRegister(Register[FleetValue]):

@@ -33,6 +33,7 @@ from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refu
 from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, V
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.words import shown
 
 BACKOFF_CAP_S = 5.0
 FROM_A_PEER = "learnt from a peer"
@@ -327,7 +328,7 @@ class Register(ABC, Generic[V]):
         if current is not None and value.revision <= current.revision:
             if value.revision == current.revision and value != current:
                 both = f"{self._named(current)} and {self._named(value)}"
-                self.problem = f"two values for revision {value.revision}: {both}"
+                self.problem = f"two values for revision {shown(value.revision)}: {both}"
             return
         self._set_state(learnt=value)
         self._lease_over_at = -math.inf
@@ -488,7 +489,7 @@ class Register(ABC, Generic[V]):
         newest = max(accepted, key=lambda held: (held.ballot, self._prevails(held.value)), default=None)
         read = self._initial if newest is None else newest.value
         if read.revision < running.known:
-            self.problem = f"a majority of electors has forgotten revision {running.known}"
+            self.problem = f"a majority of electors has forgotten revision {shown(running.known)}"
             self._give_up(running, todo, now)
             return
         if read.revision < self.value.revision:  # learnt since we asked: a higher ballot has overtaken this one

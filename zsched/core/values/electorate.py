@@ -13,10 +13,8 @@ from itertools import pairwise
 
 from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import check_range
+from zsched.core.values.words import CREATION_STEP, check_range
 
-CREATION_STEP = 2**32
-"""Revision and epoch of a task that was created as number C start at C times this."""
 MAX_LEASE_S = 3600.0
 TOLD_DIGITS = 16
 """Beats have this many digits of a generation id, which are enough to name one."""

@@ -20,6 +20,8 @@ A_NAME = "lower-case letters, digits, '-' and '_', at most 63, the first a lette
 """`NAME` in words."""
 MAX_ASKER, MAX_ASKED = 96, 200
 """Characters of an operator's name and reason: they travel with every ballot of a task."""
+CREATION_STEP = 2**32
+"""Revision and epoch of a task that was created as number C start at C times this."""
 PAPER_METRICS = ("cpu", "memory", "network")
 """The metrics of Eq. 1 to 3; the others are gauges."""
 
@@ -49,6 +51,22 @@ NO_SPARE = "no other candidate can take it"
 COUNTED_ANEW = "since the relay's start or the stream's last change"
 """A stream keeps its count over both, so a message in it may have come before."""
 _READY = "ready"
+
+
+def shown(number: int) -> int:
+    """A task's epoch or revision for people, who count from 1 in each creation and generation.
+
+    >>> shown(4294967297), shown(7)
+    (1, 7)
+    """
+    return number % CREATION_STEP
+
+
+def meant(number: int | None, now: int) -> int:
+    """The epoch or revision that people mean by a number, where the present one is ``now``: ``None`` is that one."""
+    if number is None:
+        return now
+    return number if number >= CREATION_STEP else now - shown(now) + number
 
 
 def told_of_worker(state: str, reason: str) -> str:

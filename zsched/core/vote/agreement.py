@@ -26,14 +26,7 @@ from zsched.core.values.beat import Beat
 from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
-from zsched.core.values.electorate import (
-    CREATION_STEP,
-    TOLD_DIGITS,
-    Creation,
-    Elector,
-    FleetValue,
-    terms_of,
-)
+from zsched.core.values.electorate import TOLD_DIGITS, Creation, Elector, FleetValue, terms_of
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
@@ -46,6 +39,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import NO_BALLOT, Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.struct import replace
+from zsched.core.values.words import CREATION_STEP, shown
 from zsched.core.vote.acceptor import Acceptor
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fleet_fit, is_proven
 from zsched.core.vote.commands import answer_end, refuse_gone, wanted_retune
@@ -856,7 +850,7 @@ class Agreement:
         if outcome is RoundOutcome.COMMITTED:
             todo.add(do.PublishLearnt(learnt=self.learnt()))
         if isinstance(change, MoveOwner):
-            text = f"move to {change.owner} on revision {change.base_revision}: {outcome}"
+            text = f"move to {change.owner} on revision {shown(change.base_revision)}: {outcome}"
             todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
         answer_end(ended, value, todo)
 

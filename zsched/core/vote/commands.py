@@ -15,6 +15,7 @@ from zsched.core.values.change import Ended, Retune, RoundOutcome, SetLeased
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import Allocation, TaskId, Weights
 from zsched.core.values.struct import replace
+from zsched.core.values.words import shown
 
 _ENDED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
@@ -40,7 +41,7 @@ def wanted_retune(event: ev.WeightsCommanded, registers: Mapping[TaskId, TaskReg
         return None
     value = register.value
     if command.base_revision not in (None, value.revision):
-        detail = f"revision is {value.revision}, not {command.base_revision}"
+        detail = f"revision is {shown(value.revision)}, not {shown(command.base_revision)}"
         _refuse(request, CommandOutcome.CONFLICT, detail, todo)
     elif weights == value.tuning.weights:
         _refuse(request, CommandOutcome.UNCHANGED, _ENDED[RoundOutcome.UNCHANGED][1], todo)

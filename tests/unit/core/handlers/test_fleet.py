@@ -21,12 +21,12 @@ from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Rollout, Text
-from zsched.core.values.electorate import CREATION_STEP
 from zsched.core.values.fleet import Fleet, StreamRule, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
 from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import Direction, StreamCount
 from zsched.core.values.profile import Jobs, Renewal, WorkerState
+from zsched.core.values.words import CREATION_STEP
 
 START = 100.0
 

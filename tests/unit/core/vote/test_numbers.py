@@ -25,7 +25,7 @@ from zsched.core.register.register import MAX_REVISION
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.electorate import CREATION_STEP, Creation, FleetValue
+from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
@@ -41,6 +41,7 @@ from zsched.core.values.messages import (
     fleet_answer,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterState
+from zsched.core.values.words import CREATION_STEP
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD
 from zsched.core.vote.lease import Leases
