@@ -167,7 +167,7 @@ class Disturbance:
                 ("resume", task),
                 ("tune", task, f"bonus={choice.choice([0.02, 0.1, 0.3])}"),
                 ("tune", task, f"patience={choice.choice(['null', '0.05', '0.3'])}"),
-                ("weights", task, f"cpu={cpu}", f"memory={1 - cpu:.1f}", "network=0"),
+                ("tune", task, f"cpu={cpu}", f"memory={1 - cpu:.1f}", "network=0"),
                 ("drain", edge, "--detach", "--for", f"{choice.randint(10, 60)}s"),
                 ("undrain", edge),
                 ("eligible", edge, "off", "--for", f"{choice.randint(10, 60)}s"),

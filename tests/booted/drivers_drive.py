@@ -100,7 +100,7 @@ def observe() -> dict[str, object]:
     run("systemctl", "stop", unit(other))
     stopped = wait_for(lambda seen: workers(seen)[other]["state"] == "failed" and owner(seen) == first)
     report["stopped"], report["why"] = stopped, stopped["workers"][other]["reason"]
-    report["retry"] = run(ZSCHED, "retry", "echo", other, "--yes", "--node", "robot1", "--runtime-dir", str(RUN))
+    report["restart"] = run(ZSCHED, "restart", "echo", other, "--yes", "--node", "robot1", "--runtime-dir", str(RUN))
     report["retried"] = wait_for(is_well)
     os.kill(int(shown(first)["MainPID"]), signal.SIGKILL)
     report["daemon_killed"] = wait_for(lambda seen: owner(seen) == other and ended(first))

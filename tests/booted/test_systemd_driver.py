@@ -97,7 +97,7 @@ def test_a_task_moves_from_unit_to_unit_and_its_log_is_there(report: dict[str, A
 def test_a_unit_that_is_killed_starts_again_and_the_next_failure_moves_the_task(report: dict[str, Any]) -> None:
     check(report, "killed", "again", "stopped")
     assert "has ended or was stopped by somebody else" in report["why"]
-    assert report["retried"]["holds"], report["retry"]
+    assert report["retried"]["holds"], report["restart"]
 
 
 def test_units_end_with_their_daemon_however_that_ends(report: dict[str, Any]) -> None:

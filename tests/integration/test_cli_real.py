@@ -149,20 +149,20 @@ def test_watch_gives_newer_and_newer_statuses(site: Site) -> None:
 
 
 def test_weights_are_agreed_shown_and_refused_on_an_old_revision(site: Site) -> None:
-    before = json.loads(site.zsched("weights", "echo", "--json").stdout)
-    changed = site.zsched("weights", "echo", "cpu=0.6", "memory=0.4", "--yes", "--json")
+    (before,) = json.loads(site.zsched("tune", "echo", "--json").stdout)["tasks"]
+    changed = site.zsched("tune", "echo", "cpu=0.6", "memory=0.4", "--yes", "--json")
     assert changed.returncode == 0, changed.stderr
-    body = json.loads(changed.stdout)
+    (body,) = json.loads(changed.stdout)["tasks"]
     assert body["outcome"] == "ok"
     assert body["revision"] > before["revision"]
     assert site.status()["tasks"][0]["tuning"]["weights"] == {"cpu": 0.6, "memory": 0.4, "network": 0.0, "gauges": {}}
 
-    again = site.zsched("weights", "echo", "cpu=0.6", "memory=0.4")
+    again = site.zsched("tune", "echo", "cpu=0.6", "memory=0.4")
     assert (again.returncode, again.stdout) == (0, "Nothing would change.\n")
-    old = site.zsched("weights", "echo", "cpu=1", "--yes", "--revision", str(before["revision"]))
+    old = site.zsched("tune", "echo", "cpu=1", "memory=0", "--yes", "--revision", str(before["revision"]))
     assert old.returncode == 1
     assert "conflict" in old.stderr
-    unknown = site.zsched("weights", "ecko", "cpu=1")
+    unknown = site.zsched("tune", "ecko", "cpu=1")
     assert unknown.returncode == 2
     assert "echo" in unknown.stderr
 
@@ -257,7 +257,7 @@ def look_from_a_machine_without_a_daemon(folder: Path, here: Site, there: Site) 
     for verb in (
         ("wait", "--for", "settled=echo"),
         ("metrics", "print"),
-        ("weights", "echo"),
+        ("tune", "echo"),
         ("stream", "list", "--node", there.node, "--window", "0.2"),
     ):
         done = laptop.zsched(*verb, "--connect", endpoint)
@@ -305,7 +305,7 @@ def test_any_node_of_the_fleet_can_be_asked_through_the_one_here(tmp_path: Path)
         asked = here.status("--node", there.node)
         assert asked["node"] == there.node
         assert asked["tasks"][0]["decision"] is not None, "an edge does not decide, the robot does"
-        changed = here.zsched("weights", "echo", "cpu=0.7", "memory=0.3", "--yes", "--node", there.node)
+        changed = here.zsched("tune", "echo", "cpu=0.7", "memory=0.3", "--yes", "--node", there.node)
         assert changed.returncode == 0, changed.stderr
         look_from_a_machine_without_a_daemon(tmp_path, here, there)
         nowhere = here.zsched("status", "--node", "robot9")

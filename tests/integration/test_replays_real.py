@@ -212,7 +212,7 @@ class Scene:
     def turns(self, task_weights: float, robot: str) -> None:
         """Change a weight at a robot: it asks the electors, and tells everybody."""
         wanted = (f"cpu={task_weights}", f"memory={1 - task_weights}")
-        self.operator.done("weights", TASK, *wanted, "--yes", "--node", robot)
+        self.operator.done("tune", TASK, *wanted, "--yes", "--node", robot)
 
 
 @pytest.fixture(scope="module")

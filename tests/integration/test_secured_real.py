@@ -75,7 +75,7 @@ def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed
     assert bed.status("robot1")["security"] == "secured"
     before = bed.task("robot1")["tuning"]
 
-    change = ["weights", TASK, "cpu=0.25", "memory=0.75", "--yes", "--connect", endpoint]
+    change = ["tune", TASK, "cpu=0.25", "memory=0.75", "--yes", "--connect", endpoint]
     refused = zsched(bed, "screen", *change)
     assert refused.returncode == 1
     assert "screen is a guest of fleet testbed and may only ask for its status and read streams" in refused.stderr
@@ -83,13 +83,13 @@ def test_an_operator_commands_from_elsewhere_and_a_guest_only_looks(bed: Testbed
     assert bed.task("robot1")["tuning"] == before
     done = zsched(bed, "ana", *change)
     assert done.returncode == 0, done.stderr
-    assert "command=SetWeights from=ana" in bed.log("robot1")
+    assert "command=TuneTask from=ana" in bed.log("robot1")
     assert "from=screen" not in bed.log("robot1")
     bed.wait(
         lambda: bed.task("robot2")["tuning"]["weights"]["memory"] == 0.75, 60, "the new weights at the other robot"
     )
     bed.wait(
-        lambda: "SetWeights came, signed by ana.operator" in zsched(bed, "robot1", "events").stdout,
+        lambda: "TuneTask came, signed by ana.operator" in zsched(bed, "robot1", "events").stdout,
         60,
         "the command in the decision log, with the operator's name",
     )
@@ -197,7 +197,7 @@ def test_who_has_a_member_s_link_and_not_its_key_says_nothing_where_it_counts(be
 
         def repeats() -> bool:
             for node, cpu in (("robot1", 0.5), ("robot2", 0.25)):  # each of them asks the electors, and tells
-                assert zsched(bed, node, "weights", TASK, f"cpu={cpu}", f"memory={1 - cpu}", "--yes").returncode == 0
+                assert zsched(bed, node, "tune", TASK, f"cpu={cpu}", f"memory={1 - cpu}", "--yes").returncode == 0
             for sample in tuple(said):
                 frame, seal = sample.payload.to_bytes(), sample.attachment
                 assert seal is not None, "members sign what they have learnt"

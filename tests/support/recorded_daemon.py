@@ -31,7 +31,7 @@ class Daemon:
     def _answer(self, request: Json) -> Json:
         self.asked.append(request)
         time.sleep(self.delay_s)
-        if request["verb"] in ("weights", "retry", "restart"):
+        if request["verb"] in ("tune", "restart"):
             return self.result
         if request["verb"] == "lines":
             lines = [one for one in self.lines if one["number"] > request["after"]][:2]

@@ -34,7 +34,6 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    RetryTask,
     SetWeights,
     TakeCertificate,
     Utilities,
@@ -408,9 +407,6 @@ class Storm:
         if self.rng.random() < 0.2:
             return ev.ExplanationAsked(request=self.number(), command=ExplainTask(task=self.task()))
         if self.rng.random() < 0.2:
-            whose = self.rng.choice(("", self.name()))
-            return ev.RetryCommanded(request=self.number(), command=RetryTask(task=self.task(), node=whose))
-        if self.rng.random() < 0.1:
             return ev.RestartCommanded(request=self.number(), command=RestartTask(task=self.task()))
         if self.rng.random() < 0.1:
             return ev.LinesAsked(request=self.number(), command=ReadLines(task=self.task()))

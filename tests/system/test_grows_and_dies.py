@@ -112,7 +112,7 @@ def test_one_machine_becomes_nine_and_two_of_them_are_left(tmp_path: Path, netwo
                 until(lambda: owner(hall) in alive, f"the task has an owner without {dead}")
                 until(probe.is_flowing, f"the task goes on without {dead}")
             assert len(set(electors(hall)) & alive) == 2, "two of three electors are left, and agree"
-            hall.zsched(FIRST, "weights", "echo", "cpu=0.6", "memory=0.4", "network=0", "--yes")
+            hall.zsched(FIRST, "tune", "echo", "cpu=0.6", "memory=0.4", "network=0", "--yes")
             gap = longest_gap(probe, began)
             print(f"the longest gap of robot1's answers from one machine to nine to two: {gap:.2f} s")
             assert gap < GAP_S

@@ -110,8 +110,8 @@ def test_status_loads_nothing_heavy_even_when_nobody_answers(folder: Path) -> No
     assert "typer" in loaded
 
 
-def test_status_and_weights_load_nothing_heavy(daemon: Daemon, folder: Path) -> None:
-    for arguments in (("status",), ("status", "--json", "--node", "robot1"), ("weights", "echo")):
+def test_status_and_tune_load_nothing_heavy(daemon: Daemon, folder: Path) -> None:
+    for arguments in (("status",), ("status", "--json", "--node", "robot1"), ("tune", "echo")):
         code, loaded = loaded_by(folder, *arguments)
         assert code == 0
         assert loaded & set(FOREIGN) == set()

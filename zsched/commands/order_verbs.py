@@ -173,35 +173,6 @@ def tune(
     raise typer.Exit(give(view, task, pairs or []))
 
 
-def weights(
-    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; without it: show all.")] = None,
-    pairs: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[NAME=NUMBER]...", help="New weights: cpu, memory, network, gauges; left out is 0, the sum is 1."
-        ),
-    ] = None,
-    reason: ReasonOption = "",
-    revision: RevisionOption = None,
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
-    """Show a task's weights, or change them on the whole running fleet.
-
-    A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
-    """
-    from zsched.commands.weights import weights as give  # noqa: PLC0415 - each verb imports what it needs
-
-    if revision is not None and not pairs:
-        raise CliError(EXIT_USAGE, "--revision goes with new weights, e.g. cpu=0.6 memory=0.4")
-    view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
-    raise typer.Exit(give(view, task, pairs or []))
-
-
 def restart(
     task: TaskArgument,
     whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
@@ -213,35 +184,11 @@ def restart(
     runtime_dir: RuntimeOption = None,
     connect: ConnectOption = None,
 ) -> None:
-    """Stop a task's worker and start it again; that counts as no failure.
+    """Stop a task's worker and start it again, also one that has failed for good; that counts as no failure.
 
     The task pauses meanwhile if it is the owner's.
     """
     from zsched.commands.restart import restart as give  # noqa: PLC0415 - each verb imports what it needs
-
-    raise typer.Exit(
-        give(order_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)
-    )
-
-
-def retry(
-    task: TaskArgument,
-    whose: Annotated[
-        str | None, typer.Argument(metavar="[NODE]", help="Whose failures are forgotten; without it everybody's.")
-    ] = None,
-    reason: ReasonOption = "",
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
-    """Forget a task's failures: a failed worker is started again, and nodes pay no penalty any more.
-
-    Exits with 5 when some nodes could not be asked: they remember.
-    """
-    from zsched.commands.retry import retry as give  # noqa: PLC0415 - each verb imports what it needs
 
     raise typer.Exit(
         give(order_view(node, runtime_dir, connect, reason, None, None, json_=json_, yes=yes, plan=plan), task, whose)

@@ -86,7 +86,7 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
     because = f": {why}" if why else ""
     if state != "failed":
         return f"the worker on {owner} {told_of_worker(state, why)}"
-    return f"the worker on {owner} failed{because}; mend it, then `zsched retry {task['name']} {owner}`"
+    return f"the worker on {owner} failed{because}; mend it, then `zsched restart {task['name']} {owner}`"
 
 
 def render_status(status: Json, width: int, color: bool, at: float | None = None) -> str:

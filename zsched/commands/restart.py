@@ -9,7 +9,6 @@ from zsched.commands.ask import ask_door
 from zsched.commands.common import CliError, print_json, say
 from zsched.commands.logs import worker_node
 from zsched.commands.orders import CODES, OrderView, begin, check_said
-from zsched.commands.retry import worker_states
 from zsched.exits import EXIT_FAILED
 
 SCHEMA = "zsched.restart/1"
@@ -27,7 +26,9 @@ def restart(view: OrderView, task: str, whose: str | None) -> int:
     node = worker_node(status, task, whose)
     owner = next(known["owner"] for known in status["tasks"] if known["name"] == task)
     after = "started again; the task pauses until it is ready" if node == owner else "started again"
-    rows = [(task, f"worker on {node}", worker_states(status, task).get(node, "-"), after)]
+    workers = next(one["workers"] for one in status["nodes"] if one["name"] == node)
+    state = next((str(worker["state"]) for worker in workers if worker["task"] == task), "-")
+    rows = [(task, f"worker on {node}", state, after)]
     plan = {"schema": SCHEMA, "task": task, "node": node, "outcome": "planned", "detail": after}
     code = begin(view, rows, plan, is_change=True, warning=f"{node} owns {task}." if node == owner else "")
     if code is not None:

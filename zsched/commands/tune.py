@@ -5,6 +5,7 @@ Knows: their names, how a value is read and shown. Does not know: what a task do
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Any, Final
@@ -139,6 +140,10 @@ def _checked(after: Json, file: Json) -> Json:
     """
     from zsched.wire.codec import as_plain  # noqa: PLC0415 - the other orders need no codec
 
+    total = math.fsum(after["weights"].values())
+    if not math.isclose(total, 1.0, abs_tol=1e-6):
+        given = " ".join(f"{name}={weight:g}" for name, weight in after["weights"].items())
+        raise CliError(EXIT_USAGE, f"the weights' sum must be 1, and {given} make {total:g}; nothing was changed")
     try:
         deadline_ms = after.get("deadline_ms")
         tuning = Tuning(

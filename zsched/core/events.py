@@ -29,7 +29,6 @@ from zsched.core.values.messages import (
     ReadLines,
     Refused,
     RestartTask,
-    RetryTask,
     SetWeights,
     TakeCertificate,
     TuneTask,
@@ -397,13 +396,6 @@ class TuneCommanded(Struct, frozen=True, kw_only=True):
     command: TuneTask
 
 
-class RetryCommanded(Struct, frozen=True, kw_only=True):
-    """An operator orders that failures are forgotten."""
-
-    request: int
-    command: RetryTask
-
-
 class ExplanationAsked(Struct, frozen=True, kw_only=True):
     """An operator asks for this node's last judgement of a task."""
 
@@ -573,7 +565,6 @@ Event = (
     | MoveCommanded
     | HoldCommanded
     | TuneCommanded
-    | RetryCommanded
     | ExplanationAsked
     | RestartCommanded
     | CertificateSent
@@ -605,8 +596,6 @@ def commanded(request: int, command: Command, *, is_near: bool = False) -> Event
         return RehearsalsAsked(request=request, command=command)
     if isinstance(command, ExplainTask):
         return ExplanationAsked(request=request, command=command)
-    if isinstance(command, RetryTask):
-        return RetryCommanded(request=request, command=command)
     if isinstance(command, RestartTask):
         return RestartCommanded(request=request, command=command)
     if isinstance(command, TakeCertificate):

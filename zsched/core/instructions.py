@@ -179,12 +179,6 @@ class StopWorker(Struct, frozen=True, kw_only=True):
     task: TaskId
 
 
-class ResetWorker(Struct, frozen=True, kw_only=True):
-    """Forget the failures of this node's worker for the task; it is started again if it is wanted."""
-
-    task: TaskId
-
-
 class RestartWorker(Struct, frozen=True, kw_only=True):
     """This node's worker for the task hangs: kill it, count a failure, start it again."""
 
@@ -440,7 +434,6 @@ Instruction = (
     | TryAddresses
     | StartWorker
     | StopWorker
-    | ResetWorker
     | RestartWorker
     | RenewWorker
     | StrikeDaemon

@@ -481,7 +481,7 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         is_server_ready &= name != server or load.state is WorkerState.READY
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
-            yield f"the worker on {name} failed{why}; mend it, then `zsched retry {task.name} {name}`"
+            yield f"the worker on {name} failed{why}; mend it, then `zsched restart {task.name} {name}`"
         elif (name == server and load.state is not WorkerState.READY) or (
             _is_in_the_way(task, load) and (owner is None or _may_follow(node, task, profile, server))
         ):

@@ -25,7 +25,6 @@ _LOCAL = frozenset(
         do.SetRole,
         do.StartWorker,
         do.StopWorker,
-        do.ResetWorker,
         do.RenewWorker,
         do.RestartWorker,
         do.StrikeDaemon,

@@ -39,7 +39,6 @@ TOKEN: Final = "ZSCHED_DEV_RUN"
 HURRY_S: Final = 0.4
 """Between the two signals of an end: a daemon that is told to stop twice goes at once."""
 STOP_S: Final = 6.0
-WORKER_STOP_S: Final = 1.0
 POLL_S: Final = 0.02
 ASK_S: Final = 1.0
 LONGEST_FOLDER: Final = 60
@@ -209,26 +208,10 @@ class Nodes:
         pids = (pid for pid, words in _environments() if marks <= words)
         return next((pid for pid in pids if _leads(pid)), None)
 
-    def restart_worker(self, node: NodeId, task: TaskId) -> bool:
-        """End a node's worker, whose daemon starts it again, and forget its failures; false when the daemon is away."""
-        pid = self.worker(node, task)
-        if pid is not None:
-            for number in (signal.SIGTERM, signal.SIGKILL):
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(pid, number)
-                end = monotonic_s() + WORKER_STOP_S
-                while _leads(pid) and monotonic_s() < end:
-                    time.sleep(POLL_S)
-        return self.forget(node, task)
-
-    def forget(self, node: NodeId, task: TaskId) -> bool:
-        """Let every node forget that the task's worker on ``node`` has failed; false when ``node`` does not answer."""
-        answers = {}
-        for asked in self.names:
-            if self.is_up(asked):
-                with contextlib.suppress(AdapterError):
-                    answers[asked] = self._ask(asked, {"verb": "retry", "task": task, "whose": node})
-        return node in answers
+    def restart_worker(self, node: NodeId, task: TaskId) -> None:
+        """Have a node's worker started again, without its failures, if the node's daemon answers."""
+        with contextlib.suppress(AdapterError):
+            self._ask(node, {"verb": "restart", "task": task})
 
     # --- looking -----------------------------------------------------------------------------------------------------
 

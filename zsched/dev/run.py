@@ -228,7 +228,7 @@ class Run:
         known = (node, task) in self._failed
         if state == "failed" and not known:
             self._failed.add((node, task))
-            retry = f"mend it, then `zsched retry {task} {node} --runtime-dir {self._nodes.folder} --node {node}`"
+            retry = f"mend it, then `zsched restart {task} {node} --runtime-dir {self._nodes.folder} --node {node}`"
             again = "mend it and save it, and it is started again" if self._watched.files.get(task) else retry
             self._say(f"{task}: its worker on {node} has failed; {again}")
         elif state == "ready" and known:

@@ -173,7 +173,7 @@ def _worker(node: str, load: Json) -> Result:
     task, state, reason = str(load["task"]), str(load["state"]), str(load.get("reason") or "")
     told = f"the worker of {task} {told_of_worker(state, reason)}"
     if state == "failed":
-        return failed(told, fix=f"mend its cause, then: zsched retry {task} {node}")
+        return failed(told, fix=f"mend its cause, then: zsched restart {task} {node}")
     if has_lost_its_worker(state, reason) and state != "stopped":
         return failed(told, fix=f"zsched logs {task} {node}; zsched restart {task} {node} starts it anew")
     if state == "stopped" and reason.startswith(WAS_READY):

@@ -37,7 +37,6 @@ from zsched.core.values.messages import (
     ReadHistory,
     ReadLines,
     RestartTask,
-    RetryTask,
     SetWeights,
     TakeCertificate,
     TuneTask,
@@ -213,11 +212,6 @@ def _tune_of(request: dict[str, Any]) -> TuneTask:
     return TuneTask(task=str(request["task"]), tuning=tuning, base_revision=base, asked=_asked_of(request))
 
 
-def _retry_of(request: dict[str, Any]) -> RetryTask:
-    asked = _asked_of(request) if "by" in request else None
-    return RetryTask(task=str(request["task"]), node=str(request.get("whose") or ""), asked=asked)
-
-
 def _explain_of(request: dict[str, Any]) -> ExplainTask:
     return ExplainTask(task=str(request["task"]))
 
@@ -297,7 +291,6 @@ _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
     "move": _move_of,
     "hold": _hold_of,
     "tune": _tune_of,
-    "retry": _retry_of,
     "explain": _explain_of,
     "restart": _restart_of,
     "lines": _lines_of,

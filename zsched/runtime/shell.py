@@ -219,8 +219,6 @@ class Shell:
                 self.measure_soon()
             case do.StopWorker(task=task):
                 self._workers().stop(task)
-            case do.ResetWorker(task=task):
-                self._workers().reset(task)
             case do.RenewWorker(task=task):
                 self._workers().renew(task)
             case do.RestartWorker(task=task, reason=reason):

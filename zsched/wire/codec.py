@@ -57,7 +57,6 @@ KINDS: dict[str, tuple[type, int]] = {
     "move_task": (messages.MoveTask, SMALL),
     "hold_task": (messages.HoldTask, SMALL),
     "tune_task": (messages.TuneTask, SMALL),
-    "retry_task": (messages.RetryTask, SMALL),
     "explain_task": (messages.ExplainTask, SMALL),
     "explanation": (decision.Explanation, LARGE),
     "restart_task": (messages.RestartTask, SMALL),

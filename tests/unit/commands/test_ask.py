@@ -220,7 +220,7 @@ def test_a_silent_node_of_a_secured_fleet_is_not_taken_for_a_wrong_address(
     monkeypatch.setattr(ask, "_visit", lambda *_given: SimpleNamespace(is_guest=False, asker="ana"))
     door = Door(socket=Path(), endpoint="tls/robot1:7457", node=node)
     with pytest.raises(CliError) as caught:
-        ask_door(door, {"verb": "retry", "task": "merge", "by": "ana"})
+        ask_door(door, {"verb": "restart", "task": "merge", "by": "ana"})
     assert caught.value.code == EXIT_UNREACHABLE
     if why is None:
         assert str(caught.value) == "robot1 did not answer within 3 s"
@@ -246,7 +246,7 @@ def test_an_order_without_an_answer_may_have_been_carried_out_unless_it_was_not_
 
     monkeypatch.setattr(ask, "_client", lambda _endpoint: There())
     monkeypatch.setattr(ask, "_visit", lambda *_given: SimpleNamespace(is_guest=False, asker="ana"))
-    door, order = Door(socket=Path(), endpoint=endpoint, node=node), {"verb": "retry", "task": "merge", "by": "ana"}
+    door, order = Door(socket=Path(), endpoint=endpoint, node=node), {"verb": "restart", "task": "merge", "by": "ana"}
     if code == 0:
         told = {"outcome": "unknown", "detail": f"{node} did not answer within 3 s", "revision": None}
         assert ask_door(door, order) == told
@@ -321,7 +321,7 @@ def test_in_a_secured_cell_a_command_goes_to_the_gateway_that_it_names(
     monkeypatch.setattr(ask, "_client", lambda gateway, _cell: Gateway(names[gateway]))
     monkeypatch.setattr(ask, "_visit", lambda *_given: SimpleNamespace(is_guest=False))
     cell = Cell(name="hall-b", gateways=tuple(names), file=str(tmp_path / "none"))
-    order = {"verb": "retry", "task": "merge", "by": "ada@robot9"}
+    order = {"verb": "restart", "task": "merge", "by": "ada@robot9"}
     assert ask_door(door_of(cell, "hall-a", None, "robot1"), order)["outcome"] == "ok"
     assert ask_door(door_of(cell, "hall-a", None, "edge1"), order)["outcome"] == "ok"
     assert asked == [("robot1", "robot1"), ("edge1", "edge1")]

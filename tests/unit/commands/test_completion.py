@@ -49,10 +49,10 @@ def offered(*words: str) -> list[str]:
         (("stream", ""), ["bw", "hz", "list", "tail"]),
         (("status", "--v"), ["--verbose"]),
         (("stream", "list", "--win"), ["--window"]),
-        (("weights", ""), ["merge"]),
-        (("weights", "--json", "m"), ["merge"]),
-        (("weights", "--revision", "3", "m"), ["merge"]),
-        (("retry", "merge", ""), ["ada", "bob", "eve"]),
+        (("tune", ""), ["merge"]),
+        (("tune", "--json", "m"), ["merge"]),
+        (("tune", "--revision", "3", "m"), ["merge"]),
+        (("restart", "merge", ""), ["ada", "bob", "eve"]),
         (("status", "--node", "b"), ["bob"]),
         (("status", "-n", ""), ["ada", "bob", "eve"]),
         (("completion", ""), ["bash", "fish", "zsh"]),
@@ -60,7 +60,7 @@ def offered(*words: str) -> list[str]:
         (("up", "--log-level", "D"), ["DEBUG"]),
         (("check", ""), []),
         (("nothing", ""), []),
-        (("retry", "merge", "bob", ""), []),
+        (("restart", "merge", "bob", ""), []),
     ],
 )
 def test_the_next_word(words: tuple[str, ...], expected: list[str]) -> None:
@@ -68,7 +68,7 @@ def test_the_next_word(words: tuple[str, ...], expected: list[str]) -> None:
 
 
 def test_all_verbs_are_offered_but_hidden_ones() -> None:
-    assert {"status", "weights", "completion"} <= set(offered(""))
+    assert {"status", "tune", "completion"} <= set(offered(""))
     assert "complete" not in offered("")
 
 
@@ -78,14 +78,14 @@ def test_a_daemon_here_knows_the_names_better_than_the_file(tmp_path: Path) -> N
     daemon.open()
     try:
         assert offered("status", "--node", "") == NODES
-        assert offered("weights", "") == ["echo"]
+        assert offered("tune", "") == ["echo"]
     finally:
         daemon.close()
 
 
 def test_without_a_daemon_and_a_file_nothing_is_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
-    assert offered("weights", "") == []
+    assert offered("tune", "") == []
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
@@ -104,7 +104,7 @@ def test_bash_completes_a_task_s_name(tmp_path: Path) -> None:
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m zsched.cli "$@"\n')
     program.chmod(0o755)
     script = CliRunner().invoke(app, ["completion", "bash"]).stdout
-    script += f'COMP_WORDS=({program} weights m); COMP_CWORD=2; _zsched {program}; echo "${{COMPREPLY[@]}}"\n'
+    script += f'COMP_WORDS=({program} tune m); COMP_CWORD=2; _zsched {program}; echo "${{COMPREPLY[@]}}"\n'
     done = subprocess.run(["bash"], input=script, capture_output=True, text=True, timeout=60, check=False)
     assert (done.stdout, done.stderr) == ("merge\n", "")
 
@@ -126,9 +126,9 @@ def test_every_verb_has_a_page_with_all_its_options() -> None:
     found = pages(typer.main.get_command(app))
     assert {"zsched.1", "zsched-status.1", "zsched-stream.1", "zsched-stream-list.1"} <= set(found)
     assert not [name for name in found if "complete." in name or "demo" in name]
-    page = found["zsched-weights.1"]
-    assert '.TH "ZSCHED-WEIGHTS" "1" "" "zsched" "zsched"' in page
-    for text in ("\\-\\-revision N", "\\-\\-json", "TASK", "[NAME=NUMBER]", ".SH DESCRIPTION\nShow a task's weights"):
+    page = found["zsched-tune.1"]
+    assert '.TH "ZSCHED-TUNE" "1" "" "zsched" "zsched"' in page
+    for text in ("\\-\\-revision N", "\\-\\-json", "TASK", "[KEY=VALUE]", ".SH DESCRIPTION\nShow a task's tuning"):
         assert text in page
     assert ".SH EXIT STATUS\n0 fine, 1 failed" in found["zsched.1"]
 

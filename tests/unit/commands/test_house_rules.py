@@ -25,7 +25,7 @@ CLI_PAGE = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
 RULES = ("--plan", "--yes", "--revision", "--reason", "--json")
 """What every changing verb has, unless the page says why not."""
 CHANGING = {
-    *("move", "pin", "unpin", "pause", "resume", "tune", "weights", "restart", "retry", "drain", "undrain", "eligible"),
+    *("move", "pin", "unpin", "pause", "resume", "tune", "restart", "drain", "undrain", "eligible"),
     *(
         "apply",
         "edit",
@@ -62,7 +62,7 @@ OTHERS = {
     *("stream list", "stream hz", "stream bw", "stream tail", "metrics print", "metrics write", "demo", "bench paper"),
 }
 """What changes no fleet; `pki` makes files for an authority."""
-LISTING = ("pin", "unpin", "pause", "resume", "tune", "weights", "drain", "undrain", "eligible")
+LISTING = ("pin", "unpin", "pause", "resume", "tune", "drain", "undrain", "eligible")
 
 
 def verbs() -> dict[str, set[str]]:
@@ -184,9 +184,7 @@ ORDERS: dict[str, tuple[str, ...]] = {
     "pause": ("map_merge",),
     "resume": ("map_merge",),
     "tune": ("map_merge", "bonus=0.3"),
-    "weights": ("map_merge", "cpu=1"),
     "restart": ("map_merge", "edge2"),
-    "retry": ("map_merge", "edge2"),
     "drain": ("edge1",),
     "undrain": ("robot3",),
     "eligible": ("edge1", "off"),

@@ -407,7 +407,7 @@ def test_failed_worker_of_the_owner_is_degraded_and_one_elsewhere_is_not() -> No
     status["nodes"][1]["workers"][0]["state"] = "failed"
     assert degradations(status) == ()
     status["nodes"][0]["workers"][0]["state"] = "failed"
-    assert degradations(status) == ("echo: the worker on edge1 failed; mend it, then `zsched retry echo edge1`",)
+    assert degradations(status) == ("echo: the worker on edge1 failed; mend it, then `zsched restart echo edge1`",)
     status["nodes"][0]["workers"][0] |= {"state": "stopped", "reason": "nobody subscribes to a/key"}
     assert degradations(status) == ("echo: the worker on edge1 is stopped: nobody subscribes to a/key",)
 

@@ -115,7 +115,7 @@ def test_daemon_that_does_not_answer_in_time_is_told_from_one_that_is_not_there(
 ) -> None:
     daemon.delay_s = 0.5
     monkeypatch.setattr(ask, "ASK_TIMEOUT_S", 0.1)
-    door, order = find_door(folder, None), {"verb": "retry", "task": "echo"}
+    door, order = find_door(folder, None), {"verb": "restart", "task": "echo"}
     for request, is_unsure in (({"verb": "status"}, False), (order, True)):
         with pytest.raises(CliError, match=r"did not answer within 0\.1 s") as raised:
             ask_door(door, request)
@@ -129,7 +129,7 @@ def test_an_order_that_is_agreed_is_waited_for_until_the_daemon_tells_its_end(
     assert ask.ORDER_TIMEOUT_S > MOST_ORDER_S, "whatever the fleet's timing"
     daemon.delay_s = 0.5
     monkeypatch.setattr(ask, "ASK_TIMEOUT_S", 0.1)
-    assert ask_door(find_door(folder, None), {"verb": "weights", "task": "echo"})["outcome"] == "ok"
+    assert ask_door(find_door(folder, None), {"verb": "tune", "task": "echo"})["outcome"] == "ok"
 
 
 def test_status_of_another_major_version_is_refused_with_advice(daemon: Daemon) -> None:
@@ -170,10 +170,9 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
         "invite": ["edge9", "--plan"],
         "logs": ["echo"],
         "restart": ["echo", "--yes"],
-        "weights": ["echo", "cpu=1", "--yes"],
+        "tune": ["echo", "bonus=0.2", "--yes"],
         "explain": ["echo"],
         "move": ["echo", "edge1", "--plan"],
-        "retry": ["echo", "--yes"],
         "bw": ["in/0"],
         "hz": ["in/0"],
         "tail": ["in/0"],
@@ -184,7 +183,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
     arguments |= {"apply": [file], "add": [file], "remove": ["echo"], "forget": ["edge1"]}
     arguments |= {"record": ["-o", str(folder / "x.mcap"), "--for", "0.1s"], "trace": ["--once"]}
     arguments |= {"hand": ["echo", "hall-b", "--plan"], "ping": ["edge1"], "bugreport": [str(folder / "report.tar.gz")]}
-    assert set(asking) >= {("status",), ("weights",), ("retry",), ("stream", "list"), ("stream", "tail")}
+    assert set(asking) >= {("status",), ("tune",), ("restart",), ("stream", "list"), ("stream", "tail")}
     del asking[asking.index(("up",))]  # it starts the daemon
     del asking[asking.index(("leave",))]  # the state folder says whose machine it is
     del asking[asking.index(("web",))]  # it serves until it is told to end: tests/parts/commands/watch
@@ -209,7 +208,7 @@ def test_the_machine_s_own_daemon_is_down_while_others_run(
     with contextlib.ExitStack() as stack:
         for name in others:
             stack.enter_context(Daemon(folder, name))
-        for verb in (("status",), ("weights", "echo"), ("retry", "echo")):
+        for verb in (("status",), ("tune", "echo"), ("restart", "echo")):
             result = run(*verb)
             assert (result.exit_code, result.stdout) == (3, ""), result.stderr
             assert f"no daemon of robot1 in {folder} (here: {', '.join(sorted(others))})" in result.stderr

@@ -364,7 +364,7 @@ def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, .
     assert arguments[-1] in result.stderr, "it names what is wrong"
 
 
-@pytest.mark.parametrize("verb", ["up", "init", "status", "weights", "stream", "check", "demo", "version"])
+@pytest.mark.parametrize("verb", ["up", "init", "status", "tune", "stream", "check", "demo", "version"])
 def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     result = run(verb, "--help")
@@ -383,7 +383,7 @@ def test_the_manual_shows_what_the_program_shows() -> None:
     at = time.mktime((2026, 11, 30, 14, 7, 28, 0, 0, -1)) + 0.9
     for render in (render_brief, render_status):
         assert render(status, 100, color=False, at=at) in manual
-    for verb in ("up", "init", "status", "weights", "check", "demo", "version"):
+    for verb in ("up", "init", "status", "tune", "check", "demo", "version"):
         assert f"| `zsched {verb}` |" in manual
     for code in (0, 1, 2, 3, 4, 5, 78):
         assert f"\n| {code} | " in manual

@@ -45,13 +45,12 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    RetryTask,
     TakeCertificate,
     Utilities,
 )
 from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
-from zsched.core.values.profile import Echo, WorkerState
+from zsched.core.values.profile import Echo, WorkerLoad, WorkerState
 from zsched.core.values.words import CREATION_STEP
 
 T = TypeVar("T")
@@ -952,30 +951,17 @@ def test_a_flight_from_a_node_that_has_not_failed_counts_in_the_cap_of_escapes(*
 # --- an operator who has mended something ----------------------------------------------------------------------------
 
 
-def test_a_retry_resets_the_worker_that_is_meant_and_forgives_its_node() -> None:
+def test_a_worker_that_somebody_has_mended_is_held_against_its_node_no_more() -> None:
     node = make("robot1")
     damping = node.rounds.tasks["merge"].damping
     for left in EDGES:
         damping.note_move(left, has_failed=True, now=100.0)
-    batch = node.handle(ev.RetryCommanded(request=7, command=RetryTask(task="merge", node="edge1")), 100.0)
-    assert of(batch, do.ResetWorker) == [], "a robot runs no worker of it"
-    assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.OK
+    tells = profile("edge1").profile
+    for number, state in enumerate((WorkerState.FAILED, WorkerState.FAILED, WorkerState.STARTING), 5):
+        assert set(damping.penalties(100.0)) == set(EDGES)
+        loads = (WorkerLoad(task="merge", state=state),)
+        node.handle(ev.ProfileReceived(profile=replace(tells, sequence=number, workers=loads)), 100.0)
     assert set(damping.penalties(100.0)) == set(EDGES) - {"edge1"}
-    node.handle(ev.RetryCommanded(request=8, command=RetryTask(task="merge")), 100.0)
-    assert damping.penalties(100.0) == {}
-
-    edge = make("edge1")
-    for whose, resets in (("", 1), ("edge1", 1), ("edge2", 0)):
-        batch = edge.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
-        assert len(of(batch, do.ResetWorker)) == resets
-        detail = of(batch, do.AnswerCommand)[0].result.detail
-        assert detail == ("its failures are forgotten, it was stopped" if resets else "nothing to forget here")
-    for whose, said in (
-        ("edge1", "edge1 has no penalty here now"),
-        ("", "no candidate has a penalty here now"),
-    ):
-        batch = node.handle(ev.RetryCommanded(request=9, command=RetryTask(task="merge", node=whose)), 100.0)
-        assert of(batch, do.AnswerCommand)[0].result.detail == said
 
 
 def test_a_worker_that_runs_by_an_old_recipe_is_started_again_once() -> None:
@@ -1014,7 +1000,7 @@ def test_a_state_that_is_lost_in_a_move_is_in_the_story() -> None:
 
 def test_a_restart_is_for_a_worker_that_runs_here_and_is_no_failure() -> None:
     edge = make("edge1")
-    for state in (WorkerState.STARTING, WorkerState.READY):
+    for state in (WorkerState.STARTING, WorkerState.READY, WorkerState.FAILED):
         edge.handle(ev.WorkerChanged(task="merge", state=state), 100.0)
         batch = edge.handle(ev.RestartCommanded(request=7, command=RestartTask(task="merge")), 100.0)
         assert of(batch, do.RenewWorker) == [do.RenewWorker(task="merge")]
@@ -1031,12 +1017,6 @@ def test_a_restart_is_for_a_worker_that_runs_here_and_is_no_failure() -> None:
         ("edge1", "other", None, "no task 'other'"),
         ("robot1", "merge", None, "robot1 has no worker of merge"),
         ("edge1", "merge", WorkerState.STOPPED, "its worker does not run"),
-        (
-            "edge1",
-            "merge",
-            WorkerState.FAILED,
-            "its worker has failed for good: mend it, then `zsched retry merge edge1`",
-        ),
     ],
 )
 def test_a_restart_of_what_does_not_run_is_refused(name: str, task: str, state: WorkerState | None, said: str) -> None:
@@ -1090,16 +1070,6 @@ def test_a_node_tells_by_which_fleet_value_it_goes() -> None:
         assert (order.request, order.with_document) == (7, with_document)
         assert (order.told.node, order.told.value) == ("robot1", node.agreement.fleet_value)
         assert (order.told.fleet_file, order.told.content) == (node.fleet_file, None)
-
-
-@pytest.mark.parametrize(
-    "command", [RetryTask(task="other"), RetryTask(task="merge", node="ghost"), RetryTask(task="merge", node="robot2")]
-)
-def test_a_retry_of_what_there_is_not_is_refused(command: RetryTask) -> None:
-    node = make("edge1")
-    batch = node.handle(ev.RetryCommanded(request=7, command=command), 100.0)
-    assert of(batch, do.ResetWorker) == []
-    assert of(batch, do.AnswerCommand)[0].result.outcome is CommandOutcome.INVALID
 
 
 @pytest.mark.parametrize("is_draining", [False, True])

@@ -616,7 +616,7 @@ def test_a_worker_that_failed_or_is_missed_is_told_with_its_reason() -> None:
         node.handle(ev.ProfileReceived(profile=profile), 100.0)
     assert build_snapshot(node, 100.0).tasks[0].problems == (
         "the worker on edge1 is stopped: nobody subscribes to a/key",
-        "the worker on edge2 failed: exited with status 1: no such map; mend it, then `zsched retry merge edge2`",
+        "the worker on edge2 failed: exited with status 1: no such map; mend it, then `zsched restart merge edge2`",
     )
 
 
@@ -685,7 +685,7 @@ def test_a_task_that_no_other_candidate_could_take_now_says_why() -> None:
     told_by(node, "edge2", 1, WorkerState.STARTING, "pid 7")
     assert problems_of(node) == ("no other candidate can take it: the worker on edge2 is starting: pid 7",)
     told_by(node, "edge3", 1, WorkerState.FAILED, "no map")
-    failed = "the worker on edge3 failed: no map; mend it, then `zsched retry merge edge3`"
+    failed = "the worker on edge3 failed: no map; mend it, then `zsched restart merge edge3`"
     assert problems_of(node) == (failed, "no other candidate can take it: the worker on edge2 is starting: pid 7")
     told_by(node, "edge2", 2, WorkerState.READY)
     assert problems_of(node) == (failed,)

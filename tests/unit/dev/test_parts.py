@@ -229,7 +229,7 @@ def test_a_failed_worker_whose_file_is_not_watched_is_tried_again_by_a_verb(tmp_
     command = ("python", "-m", "shout")
     run = Run(nodes, Watched({"shout": command}, tmp_path), say=told.append, show=lambda _: None, stop=Latch())  # type: ignore[arg-type]
     run._tell_worker(NodeId("edge1"), "shout", "failed")
-    assert f"then `zsched retry shout edge1 --runtime-dir {tmp_path} --node edge1`" in told[0]
+    assert f"then `zsched restart shout edge1 --runtime-dir {tmp_path} --node edge1`" in told[0]
 
 
 def test_what_is_wrong_with_a_task_is_told_once_when_it_has_lasted_and_again_when_it_comes_back() -> None:

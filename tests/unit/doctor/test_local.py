@@ -401,7 +401,7 @@ def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
     load = {"task": "merge", "state": "failed", "reason": "no such camera"}
     broken = answer(scene, nodes=[{"name": "edge1", "workers": [load]}])
     assert_finds(run("worker.state", broken), FAIL, "no such camera")
-    assert "zsched retry merge edge1" in run("worker.state", broken).fix
+    assert "zsched restart merge edge1" in run("worker.state", broken).fix
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@
 | ready | exit, `report_hung` (SIGKILL): a failure / `mark_gone` | backoff, failed / starting |
 | backoff | its delay | starting |
 | stopping (SIGINT, SIGTERM, SIGKILL, each after a grace) | exit | idle; after a failure backoff, failed |
-| failed | `reset` | idle |
+| failed | `renew` | idle |
 
 A failure is any end of a worker that is wanted, but for one that `renew` asked for. `max_failures` of them within
 `failure_window_s`, or one exit with status 78 ("I cannot run here"), make it failed. The restart delay doubles per
@@ -66,7 +66,7 @@ class WorkerEvents(Protocol):
         """A worker process has ended (``returncode`` as in `subprocess`: negative is a signal)."""
 
     def on_failed(self, task: TaskId, reason: str) -> None:
-        """The worker is not started again until `WorkerSupervisor.reset`."""
+        """The worker is not started again until `WorkerSupervisor.renew`."""
 
     def on_reset(self, task: TaskId) -> None:
         """The worker may be started again: its failures are forgotten."""
@@ -252,12 +252,8 @@ class WorkerSupervisor:
         """
         self._command(self._on_hung, task, incarnation, reason)
 
-    def reset(self, task: TaskId) -> None:
-        """Forget the failures of ``task``; a wanted worker is started again."""
-        self._command(self._on_reset, task)
-
     def renew(self, task: TaskId) -> None:
-        """Stop ``task``'s worker as `stop` does, and start it again; that counts as no failure."""
+        """Stop ``task``'s worker as `stop` does, and start it again, without its failures; that counts as none."""
         self._command(self._on_renew, task)
 
     def adopt(self, specs: Mapping[TaskId, WorkerSpec]) -> None:
@@ -444,6 +440,7 @@ class WorkerSupervisor:
         worker = self._workers.get(task)
         if worker is None:
             return
+        self._on_reset(task)
         if worker.phase in {_Phase.STARTING, _Phase.READY} and worker.process is not None:
             self._begin_stop(worker, worker.spec.stop_grace_s)  # whose end leads to a start, for it is still wanted
 

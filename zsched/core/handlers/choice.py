@@ -65,6 +65,7 @@ def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float)
     if node.agreement.strangers.is_one(profile.node, now):
         node.counters["profile_stranger"] += 1
         return
+    before = node.gateway.fresh(profile.node, now)
     reason = node.gateway.absorb(profile, now, node.membership.incarnation(profile.node))
     if reason is not None:
         node.counters[f"profile_{reason}"] += 1
@@ -74,6 +75,9 @@ def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float)
     if profile.progress:
         _look_for_hangs(node, todo, now)
     failed = failed_workers(profile)
+    if before is not None and before.incarnation == profile.incarnation:
+        for task in (failed_workers(before) - failed) & node.executors.keys():
+            node.rounds.forgive(task, profile.node, now)  # somebody has mended it: nothing else starts it again
     values = node.values()
     owned = {name for name, value in values.items() if value.owner == profile.node}
     for task in owned:

@@ -1,4 +1,4 @@
-"""Operators at the door: status, explanations, weights, failures to forget, workers to restart, and the order to stop.
+"""Operators at the door: status, explanations, weights, workers to restart, and the order to stop.
 
 Knows: which stage each command concerns. Does not know: how the status is put together (`zsched.core.status`), how a
 change is agreed.
@@ -14,9 +14,8 @@ from zsched.core import instructions as do
 from zsched.core.stages import Handler, Stages
 from zsched.core.status import build_explanation, build_snapshot
 from zsched.core.todo import ToDo
-from zsched.core.values.fleet import runs_worker
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import Asked, NodeId, TaskId, told_by
+from zsched.core.values.model import Asked, TaskId, told_by
 from zsched.core.values.profile import WorkerState
 
 
@@ -28,40 +27,11 @@ def _on_weights(node: Stages, event: ev.WeightsCommanded, todo: ToDo, now: float
     node.agreement.retune(event, todo, now)
 
 
-def _on_retry(node: Stages, event: ev.RetryCommanded, todo: ToDo, now: float) -> None:
-    """Forget failures: of our own worker if the command means it, and our penalties against nodes."""
-    task, whose = event.command.task, event.command.node
-    if task not in node.executors or (whose and not _may_work(node, task, whose)):
-        detail = f"no task {task!r}" if task not in node.executors else f"{whose!r} is no candidate of {task}"
-        result = CommandResult(outcome=CommandOutcome.INVALID, detail=detail)
-        todo.add(do.AnswerCommand(request=event.request, result=result))
-        return
-    node.rounds.forgive(task, whose or None, now)
-    _record(node, task, event.command.asked, f"has the failures of {whose or 'every node'} forgotten", todo)
-    state = node.worker_states.get(task) if whose in ("", node.me) else None
-    if state is not None:
-        todo.add(do.ResetWorker(task=task))
-    detail = _forgiven(node, whose) if state is None else f"its failures are forgotten, it was {state}"
-    result = CommandResult(outcome=CommandOutcome.OK, detail=detail)
-    todo.add(do.AnswerCommand(request=event.request, result=result))
-
-
 def _record(node: Stages, task: TaskId, asked: Asked | None, what: str, todo: ToDo) -> None:
     """Tell the history who has ordered it, and why."""
     who = "an operator" if asked is None else told_by(asked)
     epoch, by = node.executors[task].epoch, "" if asked is None else asked.by
     todo.add(do.RecordStory(stage="executor", text=f"{who} {what}", task=task, epoch=epoch, by=by))
-
-
-def _may_work(node: Stages, task: TaskId, whose: NodeId) -> bool:
-    return node.membership.is_known(whose) and runs_worker(node.fleet.task(task), whose, node.fleet.node(whose).kind)
-
-
-def _forgiven(node: Stages, whose: NodeId) -> str:
-    """The part for a node whose worker is not meant: robots take penalties off candidates."""
-    if not node.rounds.is_voter:
-        return "nothing to forget here"
-    return f"{whose or 'no candidate'} has {'no' if whose else 'a'} penalty here now"
 
 
 def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: float) -> None:
@@ -74,14 +44,16 @@ def _on_explanation(node: Stages, event: ev.ExplanationAsked, todo: ToDo, now: f
         todo.add(do.AnswerExplanation(request=event.request, explanation=build_explanation(node, task, now)))
 
 
-def _on_restart(node: Stages, event: ev.RestartCommanded, todo: ToDo, _now: float) -> None:
-    """Stop and start our own worker, where one of ours runs."""
+def _on_restart(node: Stages, event: ev.RestartCommanded, todo: ToDo, now: float) -> None:
+    """Stop and start our own worker, where one of ours runs or has failed; that is mended, whatever it was."""
     task = event.command.task
     state = node.worker_states.get(task)
     refusal = _why_no_restart(node, task, state)
     outcome, detail = CommandOutcome.INVALID, refusal
     if not refusal:
         _record(node, task, event.command.asked, "has its worker here started again", todo)
+        if state is WorkerState.FAILED:
+            node.rounds.forgive(task, node.me, now)
         todo.add(do.RenewWorker(task=task))
         outcome, detail = CommandOutcome.OK, f"its worker is started again, it was {state}"
     todo.add(do.AnswerCommand(request=event.request, result=CommandResult(outcome=outcome, detail=detail)))
@@ -94,8 +66,6 @@ def _why_no_restart(node: Stages, task: TaskId, state: WorkerState | None) -> st
         return f"{node.me} has no worker of {task}"
     if not node.fleet.task(task).worker.command:
         return "somebody else starts it (the task has no `command`): start it again there"
-    if state is WorkerState.FAILED:
-        return f"its worker has failed for good: mend it, then `zsched retry {task} {node.me}`"
     return "its worker does not run" if state is WorkerState.STOPPED else ""
 
 
@@ -142,7 +112,6 @@ def _on_stop(node: Stages, _event: ev.StopRequested, todo: ToDo, _now: float) ->
 HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.StatusAsked: _on_status,
     ev.WeightsCommanded: _on_weights,
-    ev.RetryCommanded: _on_retry,
     ev.ExplanationAsked: _on_explanation,
     ev.RestartCommanded: _on_restart,
     ev.LinesAsked: _on_lines,

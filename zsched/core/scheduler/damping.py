@@ -76,10 +76,9 @@ class Damping(Struct):
             self._moves.append((now, has_failed or is_escape))
         self._owner_since = now
 
-    def forgive(self, node: NodeId | None) -> None:
-        """An operator has mended ``node`` (``None``: whatever was wrong anywhere); the caps still count the moves."""
-        for name in tuple(self._points) if node is None else (node,):
-            self._points.pop(name, None)
+    def forgive(self, node: NodeId) -> None:
+        """An operator has mended ``node``; the caps still count the moves."""
+        self._points.pop(node, None)
 
     def points(self, node: NodeId, now: float) -> float:
         """What a node has collected, decayed to ``now``."""

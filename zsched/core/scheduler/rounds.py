@@ -477,8 +477,8 @@ class Rounds:
             now=now,
         )
 
-    def forgive(self, name: TaskId, node: NodeId | None, now: float) -> None:
-        """An operator has mended what was held against a node (``None``: against any); judge again at once."""
+    def forgive(self, name: TaskId, node: NodeId, now: float) -> None:
+        """An operator has mended what was held against a node; judge again at once."""
         self.tasks[name].damping.forgive(node)
         self._answer = (-1, -math.inf, None, self._answer[-1])  # it tells of what is forgotten now
         self.hurry(now)

@@ -328,23 +328,6 @@ class SetWeights(Struct, frozen=True, kw_only=True):
         check_readings("weights", self.gauges, 0.0, 1.0)
 
 
-class RetryTask(Struct, frozen=True, kw_only=True):
-    """Operator command to one node: forget the consequences of failures of the task's workers.
-
-    Sent to every node, since each remembers others. ``node`` is the node whose failures are meant; empty means all.
-    """
-
-    task: TaskId
-    node: NodeId = ""
-    asked: Asked | None = None
-    """``None``: by an older program."""
-
-    def __post_init__(self) -> None:
-        check_name("retry.task", self.task)
-        if self.node:
-            check_name("retry.node", self.node)
-
-
 class ExplainTask(Struct, frozen=True, kw_only=True):
     """Operator question to one node: its last judgement of a task, with every figure."""
 
@@ -501,7 +484,6 @@ Command = (
     | Strike
     | KeepRehearsal
     | ReadRehearsals
-    | RetryTask
     | ExplainTask
     | RestartTask
     | TakeCertificate
@@ -514,7 +496,7 @@ Command = (
     | ReadFleet
 )
 COMMANDS: tuple[type, ...] = get_args(Command)
-Ordered = SetWeights | Strike | KeepRehearsal | RetryTask | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
+Ordered = SetWeights | Strike | KeepRehearsal | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
 """Commands that carry who gives them (``asked``)."""
 Asking = ExplainTask | ReadLines | ReadHistory | ReadFleet | ReadRehearsals
 """Commands that only ask: given twice they change nothing."""

@@ -50,7 +50,6 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    RetryTask,
     SetWeights,
     TuneTask,
     Utilities,
@@ -147,7 +146,6 @@ ORDERS: tuple[Ordered, ...] = (
     HoldTask(task="merge", hold=Hold.PAUSE, asked=BOB),
     TuneTask(task="merge", tuning=tuning_of(), base_revision=3, asked=BOB),
     SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0, asked=BOB),
-    RetryTask(task="merge", asked=BOB),
     RestartTask(task="merge", asked=BOB),
     Strike(step=Step.WORKER, task="merge", asked=BOB),
     KeepRehearsal(task="merge", name="one", body=Text("{}"), told="", asked=BOB),
@@ -185,8 +183,8 @@ def test_an_operator_whose_tool_says_nothing_is_named_too_and_questions_have_no_
     ana = Holder(name="ana", role=Role.OPERATOR)
     assert set(get_args(Ordered)) == {type(order) for order in ORDERS}
     assert set(get_args(Ordered)) == {one for one in COMMANDS if "asked" in one.__annotations__}
-    signed = signed_by(ana, RetryTask(task="merge"))
-    assert isinstance(signed, RetryTask)
+    signed = signed_by(ana, RestartTask(task="merge"))
+    assert isinstance(signed, RestartTask)
     assert signed.asked == Asked(by="ana.operator")
     signed = signed_by(Holder(name="robot1"), ChangeFleet(document=Document(text=Text("x"))))
     assert isinstance(signed, ChangeFleet)

@@ -230,7 +230,7 @@ def test_stop_kills_a_stubborn_worker_and_its_grandchildren(tmp_path: Path) -> N
         wait_until(lambda: not is_running(grandchild))
 
 
-def test_worker_that_keeps_failing_fails_for_good_until_reset() -> None:
+def test_worker_that_keeps_failing_fails_for_good_until_it_is_renewed() -> None:
     with supervised(python("print('no camera'); raise SystemExit(3)")) as (supervisor, recorder):
         supervisor.start("merge")
         assert recorder.wait("failed") == ("failed", "merge", "exited with status 3: no camera")
@@ -238,7 +238,7 @@ def test_worker_that_keeps_failing_fails_for_good_until_reset() -> None:
         assert kinds == ["started", "exited"] * 3 + ["failed"]
         wait_until(lambda: supervisor.states()["merge"] is WorkerState.FAILED)
         supervisor.start("merge")
-        supervisor.reset("merge")
+        supervisor.renew("merge")
         recorder.wait("started", 4)
         assert [call[0] for call in recorder.calls][7:9] == ["reset", "started"]
 

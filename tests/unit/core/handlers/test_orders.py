@@ -30,7 +30,6 @@ from zsched.core.values.messages import (
     HoldTask,
     Learnt,
     MoveTask,
-    RetryTask,
     TuneTask,
 )
 from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState, ScoreForm
@@ -322,9 +321,6 @@ def test_every_node_writes_down_who_has_ordered_what_it_learns() -> None:
     lone.tell(ev.TuneCommanded(request=42, command=tuned))
     (story,) = [one for one in lone.done if isinstance(one, do.RecordStory) and one.by]
     assert story.text.endswith("retuned by ada@robot1 (new battery)")
-    lone.done.clear()
-    lone.tell(ev.RetryCommanded(request=42, command=RetryTask(task="merge", asked=ADA)))
-    assert [one.by for one in lone.done if isinstance(one, do.RecordStory) and one.by] == ["ada@robot1"]
 
 
 def test_a_node_that_has_not_agreed_an_order_tells_it_from_the_value_alone() -> None:

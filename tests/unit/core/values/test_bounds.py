@@ -27,7 +27,6 @@ from zsched.core.events import (
     RehearsalKept,
     RehearsalsAsked,
     RestartCommanded,
-    RetryCommanded,
     StrikeCommanded,
     TuneCommanded,
     WeightsCommanded,
@@ -62,7 +61,6 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    RetryTask,
     SetWeights,
     TakeCertificate,
     TuneTask,
@@ -188,8 +186,6 @@ NAMES = [
     (TROUBLE, "task", "trouble"),
     (WORD, "task", "jobs"),
     (ECHO, "node", "echo"),
-    (RetryTask(task="merge"), "task", "retry"),
-    (RetryTask(task="merge"), "node", "retry"),
     (RestartTask(task="merge"), "task", "restart"),
     (ReadLines(task="merge"), "task", "lines"),
     (Strike(task="merge", step=Step.DAEMON, asked=Asked(by="ada@robot1")), "task", "strike"),
@@ -286,7 +282,6 @@ def test_what_a_worker_says_of_itself_has_a_length() -> None:
 def test_each_command_is_its_own_event() -> None:
     weights = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
     assert commanded(7, weights) == WeightsCommanded(request=7, command=weights)
-    assert commanded(8, RetryTask(task="merge")) == RetryCommanded(request=8, command=RetryTask(task="merge"))
     assert commanded(9, RestartTask(task="merge")) == RestartCommanded(request=9, command=RestartTask(task="merge"))
     assert commanded(9, ReadLines(task="merge")) == LinesAsked(request=9, command=ReadLines(task="merge"))
     assert commanded(9, ReadHistory()) == HistoryAsked(request=9, command=ReadHistory())

@@ -214,7 +214,6 @@ SAMPLES: dict[str, object] = {
         base_revision=7,
     ),
     "tune_task": messages.TuneTask(task="map_merge", tuning=_TUNING, base_revision=7, asked=_ASKED),
-    "retry_task": messages.RetryTask(task="map_merge", node="edge1"),
     "explain_task": messages.ExplainTask(task="map_merge"),
     "explanation": decision.Explanation(
         node="robot1",
