@@ -11,14 +11,25 @@ from typing import TYPE_CHECKING, Any, Final
 import typer
 
 from zsched.commands.common import CliError, Verb, Verbs
-from zsched.exits import EXIT_FAILED
+from zsched.exits import EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from importlib.metadata import EntryPoint
 
 GROUP: Final = "zsched.commands"
 LAB_VERBS: Final = frozenset({"bench", "demo"})
 """Verbs of the distribution ``zsched-lab``, which a robot has not."""
+INSTEAD: Final = {
+    "add": "zsched task add FILE, or zsched node add NAME",
+    "list": "zsched status (nodes and tasks), or zsched stream list",
+    "weights": "zsched tune TASK cpu=0.6 memory=0.4 network=0",
+    "retry": "zsched restart TASK NODE",
+    "remove": "zsched node remove NODE, or zsched task remove TASK",
+}
+"""{a word that is no verb: what to write}: words of other programs, and verbs of older ones."""
+DRASTIC: Final = frozenset({"init", "leave", "recover", "rejoin", "uninstall"})
+"""Verbs that are proposed to nobody who has written something else."""
 
 
 def installed_verbs() -> dict[str, EntryPoint]:
@@ -40,9 +51,9 @@ class Program(Verbs):
         return [*own, *(name for name in installed_verbs() if name not in own)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """One verb; ``None`` when there is none of that name.
+        """One verb.
 
-        One whose distribution is not installed, or cannot be loaded, is a verb that says so: the help must list it.
+        One that is none, whose distribution is not installed, or cannot be loaded, is a verb that says so.
         """
         own = super().get_command(ctx, cmd_name)
         if own is not None:
@@ -51,7 +62,7 @@ class Program(Verbs):
         if point is None:
             if cmd_name in LAB_VERBS:
                 return _refusing(cmd_name, "it comes with zsched-lab; in a checkout of zsched: pip install . ./lab")
-            return None
+            return _refusing(cmd_name, f"there is no such verb; {_instead(cmd_name, self.commands)}", EXIT_USAGE)
         try:
             command = typer.main.get_command(point.load())
         except Exception as error:  # noqa: BLE001 - another distribution's fault must not take the others' verbs along
@@ -61,12 +72,21 @@ class Program(Verbs):
         return command
 
 
-def _refusing(name: str, text: str) -> Any:
+def _instead(name: str, verbs: Iterable[str]) -> str:
+    """What to write in place of a word that is no verb."""
+    import difflib  # noqa: PLC0415 - only when something is wrong
+
+    near = difflib.get_close_matches(name, sorted({*verbs} - DRASTIC), n=1)
+    told = INSTEAD.get(name) or "".join(f"zsched {verb}" for verb in near)
+    return f"write {told}" if told else "`zsched --help` lists them"
+
+
+def _refusing(name: str, text: str, code: int = EXIT_FAILED) -> Any:
     """A verb that does nothing but say why it cannot."""
     app = typer.Typer(rich_markup_mode=None)
 
     @app.command(name, cls=Verb, help=text, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
     def refuse() -> None:
-        raise CliError(EXIT_FAILED, text)
+        raise CliError(code, text)
 
     return typer.main.get_command(app)

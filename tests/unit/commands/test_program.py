@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from zsched.cli import app
 from zsched.commands import program
-from zsched.commands.program import GROUP, installed_verbs
+from zsched.commands.program import DRASTIC, GROUP, installed_verbs
 
 
 def run(*arguments: str) -> Result:
@@ -56,8 +56,24 @@ def test_nobody_takes_a_verb_of_the_program(monkeypatch: pytest.MonkeyPatch) -> 
     assert run("--help").stdout.count("\n  version ") == 1
 
 
-def test_what_nobody_brings_is_a_usage_error() -> None:
-    assert run("fly").exit_code == 2
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("remove", "robot2"), "write zsched node remove NODE, or zsched task remove TASK"),
+        (("list",), "write zsched status"),
+        (("stauts", "--json"), "write zsched status"),
+        (("weights", "echo", "cpu=1"), "write zsched tune TASK cpu="),
+        (("fly",), "`zsched --help` lists them"),
+        *(((near,), "") for near in ("recove", "rejion", "leav", "uninstal", "inti")),
+    ],
+)
+def test_a_word_that_is_no_verb_leads_to_what_is_meant_to_nothing_drastic(words: tuple[str, ...], says: str) -> None:
+    result = run(*words)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"zsched {words[0]}: there is no such verb; ")
+    said = " ".join(result.stderr.split())
+    assert says in said
+    assert not DRASTIC & set(said.split()), said
 
 
 @pytest.mark.parametrize(
@@ -67,7 +83,7 @@ def test_what_nobody_brings_is_a_usage_error() -> None:
         (("stream", "list", "--help"), "--window"),
         (("metrics", "--help"), "write"),
         (("complete", "--", "st"), "status\nstream\n"),
-        (("--help",), "weights"),
+        (("--help",), "uninstall"),
     ],
 )
 def test_the_program_that_builds_the_named_verb_alone_knows_what_it_needs(words: tuple[str, ...], says: str) -> None:
