@@ -16,8 +16,8 @@ from zsched.core.values.fleet import fleet_hash
 from zsched.exits import EXIT_CONFIG, EXIT_OK
 
 
-def show_faults(given: Path | None, *, is_json: bool) -> int:
-    """Show the faults of a fleet file (``None``: this machine's own), or its counts and rules; the exit code."""
+def show_faults(given: Path | None, *, is_json: bool, is_verbose: bool) -> int:
+    """Show the faults of a fleet file (``None``: this machine's own), or its counts, and its rules; the exit code."""
     result = check_file(places.config_path(given, os.environ))
     fleet = result.fleet
     counts: Json | None = None
@@ -35,10 +35,13 @@ def show_faults(given: Path | None, *, is_json: bool) -> int:
         warn(report)
     if counts is None:
         return EXIT_CONFIG
-    if not is_json:
-        say("ok: " + ", ".join(counted(number, noun) for noun, number in counts.items()))
-        say(f"hash: {digest} (nodes whose files have another one say so in `zsched status`)")
-    for first, *more in told_once(fleet.tasks, fleet.timing) if fleet is not None and not is_json else ():
+    if is_json or fleet is None:
+        return EXIT_OK
+    foreign = [task.name for task in fleet.tasks if not task.worker.command]
+    yours = f"; you start the workers of {', '.join(foreign)} yourself (no `command`)" if foreign else ""
+    said = ", ".join(counted(number, noun) for noun, number in counts.items())
+    say(f"ok: {said}; hash {digest}{yours}")
+    for first, *more in told_once(fleet.tasks, fleet.timing) if is_verbose else ():
         say(first)
         for line in more:
             say(f"  {line}", indent=4)

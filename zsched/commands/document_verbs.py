@@ -30,15 +30,16 @@ from zsched.commands.options import (
 def check(
     file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="Fleet file; as --config.")] = None,
     config: ConfigOption = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say in words when each task moves.")] = False,
     json_: JsonOption = False,
 ) -> None:
     """Check a fleet file: all faults that can be judged at once, each with file:line:col; exits with 78 on any.
 
-    Of a file without fault it says in words when each task moves, setting by setting, once for tasks alike.
+    A file without fault is one line. With -v it says when each task moves, setting by setting, once for tasks alike.
     """
     from zsched.commands.check import show_faults  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(show_faults(file or config, is_json=json_))
+    raise typer.Exit(show_faults(file or config, is_json=json_, is_verbose=verbose))
 
 
 def apply(

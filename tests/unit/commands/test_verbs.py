@@ -61,10 +61,20 @@ def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET)
     result = run("check", file)
-    assert (result.exit_code, result.stdout.splitlines()[0]) == (0, "ok: 3 nodes, 1 task, 3 electors")
+    assert (result.exit_code, result.stdout.partition("; hash ")[0]) == (0, "ok: 3 nodes, 1 task, 3 electors")
+    assert len(result.stdout.splitlines()) == 1, "-v has the rules"
     body = json.loads(run("check", file, "--json").stdout)
     assert (body["schema"], body["ok"], body["faults"]) == ("zsched.check/1", True, [])
     assert body["fleet"] == {"name": "hall", "nodes": 3, "tasks": 1, "electors": 3}
+
+
+def test_check_names_the_tasks_whose_workers_somebody_else_starts(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text(FLEET)
+    without = "; you start the workers of merge yourself (no `command`)\n"
+    assert run("check", file).stdout.endswith(without)
+    file.write_text(f"{FLEET}    worker: {{command: [sleep, '9']}}\n")
+    assert "yourself" not in run("check", file).stdout
 
 
 def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -> None:
@@ -72,7 +82,7 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
     file.write_text(FLEET)
     other.write_text(FLEET.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
     digest = fleet_hash(load_fleet(file))
-    assert run("check", file).stdout.splitlines()[1].startswith(f"hash: {digest} ")
+    assert f"; hash {digest}" in run("check", file).stdout
     assert json.loads(run("check", file, "--json").stdout)["hash"] == digest
     assert json.loads(run("check", other, "--json").stdout)["hash"] not in (None, digest)
     other.write_text("fleet: hall")
@@ -104,7 +114,7 @@ def test_check_says_in_words_when_a_task_moves(tmp_path: Path, scheduling: str, 
     file = tmp_path / "fleet.yaml"
     weights = next(line for line in FLEET.splitlines() if "weights:" in line)
     file.write_text(FLEET.replace(weights, f"{weights}\n    scheduling: {scheduling}"))
-    text = run("check", file).stdout
+    text = run("check", file, "-v").stdout
     assert [word for word in words if word not in text] == [], text
 
 
@@ -117,7 +127,7 @@ def test_check_says_once_what_holds_for_several_tasks(tmp_path: Path) -> None:
     weights = next(line for line in tasks["other"].splitlines() if "weights:" in line)
     tasks["other"] = tasks["other"].replace(weights, f"{weights}\n    scheduling: {{patience: 0.7}}")
     file.write_text(f"{head}tasks:\n" + "".join(text.rstrip() + "\n" for text in tasks.values()))
-    lines = run("check", file).stdout.splitlines()
+    lines = run("check", file, "-v").stdout.splitlines()
     assert [line.split(": a machine")[0] for line in lines if "a machine is worth" in line] == [
         "tasks alike, also",
         "other",
@@ -160,7 +170,7 @@ def test_check_takes_the_file_that_up_would(tmp_path: Path, monkeypatch: pytest.
     file.write_text(FLEET)
     monkeypatch.setenv("ZSCHED_CONFIG", str(file))
     for arguments in (("check",), ("check", "-c", file), ("check", "--config", file)):
-        assert run(*arguments).stdout.startswith("ok: 3 nodes, 1 task, 3 electors\n")
+        assert run(*arguments).stdout.startswith("ok: 3 nodes, 1 task, 3 electors; hash ")
     monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
     result = run("check")
     assert result.exit_code == 78
@@ -398,7 +408,7 @@ def test_the_manual_names_every_field_of_the_status() -> None:
 
 def test_on_a_terminal_the_rules_of_a_file_wrap_at_its_width(screen: int) -> None:
     file = REPOSITORY / "configs" / "fleet.yaml"
-    lines = run("check", file).stdout.splitlines()
+    lines = run("check", file, "-v").stdout.splitlines()
     assert max(map(len, lines)) <= screen
     assert any(line.startswith("    ") for line in lines), "none was long enough to wrap"
 
