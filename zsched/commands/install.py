@@ -113,17 +113,17 @@ def install(root: Path, *, is_plan: bool) -> int:
     old = _old_pages(prefix, root, pieces)
     needs_user = _is_this_machine(root) and not _has_user()
     if is_plan:
-        _print(f"would make {piece.path}: {piece.what}" for piece in missing)
-        _print(f"would remove {path}: {OLD_PAGE}" for path in old)
+        _tell("would make ", ((piece.path, piece.what) for piece in missing))
+        _tell("would remove ", ((path, OLD_PAGE) for path in old))
         _print([f"would make the user and group {USER}"] if needs_user else [])
         return EXIT_WOULD_CHANGE if missing or old or needs_user else EXIT_OK
     _need_rights(root)
     for piece in missing:
         _carefully(piece.path, piece.make)
-        _print([f"{piece.path}: {piece.what}"])
     for path in old:
         _carefully(path, path.unlink)
-        _print([f"removed {path}: {OLD_PAGE}"])
+    _tell("", ((piece.path, piece.what) for piece in missing))
+    _tell("removed ", ((path, OLD_PAGE) for path in old))
     if needs_user:
         _make_user(root)
         _print([f"user and group {USER}: the daemon's; members of the group may ask it and give orders"])
@@ -150,8 +150,8 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     kept = [Path("/etc/zsched"), Path("/var/lib/zsched"), prefix]
     if is_plan:
         _print(_still_a_node(root / "var/lib/zsched", is_gone=False))
-        _print(f"would stop, disable and remove {piece.path}" for piece in ours if piece.path.suffix == ".service")
-        _print(f"would remove {piece.path}" for piece in ours if piece.path.suffix != ".service")
+        _print(["would stop and disable the services"] if any(one.path.name in UNITS for one in ours) else [])
+        _tell("would remove ", ((piece.path, piece.what) for piece in ours))
         _print(f"would leave {one}" for one in stays)
         _print(left(kept, os.environ) if _is_this_machine(root) else [])
         return EXIT_WOULD_CHANGE if ours else EXIT_OK
@@ -163,7 +163,7 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
             _tool("systemctl", "disable", "--now", "--quiet", *found)
     for piece in ours:
         _carefully(piece.path, piece.path.unlink)
-        _print([f"removed {piece.path}"])
+    _tell("removed ", ((piece.path, piece.what) for piece in ours))
     for folder in {piece.path.parent for piece in ours}:
         _remove_empty(folder, root)
     _print(f"left {one}" for one in stays)
@@ -345,3 +345,13 @@ def _first_line(path: Path) -> str:
 def _print(lines: Iterable[str]) -> None:
     for line in lines:
         say(line)
+
+
+def _tell(done: str, files: Iterable[tuple[Path, str]]) -> None:
+    """Say what was done to files, each given with what it is: those of a kind in a folder are one line."""
+    kinds: dict[tuple[Path, str], list[str]] = {}
+    for path, what in files:
+        kinds.setdefault((path.parent, what), []).append(path.name)
+    for (folder, what), names in kinds.items():
+        where = folder / names[0] if len(names) == 1 else f"{len(names)} files in {folder}"
+        say(f"{done}{where}: {what}")
