@@ -6,6 +6,8 @@ that a test starts would inherit that, and tests of Ctrl-C would wait for ever. 
 A test that finds a measured time too long is run up to three times: a machine is busy once, a fault is slow each time.
 Only tests of modules that measure times are marked for that: it costs a marked test 40 ms beside other processes.
 
+Behind skipped tests stands what to install for them (`support.tools`).
+
 Below a red test with real processes stands how the machine was meanwhile (`support.stalls`).
 
 The garbage collector does not look again at what the collection of tests has made, and looks more seldom at the rest:
@@ -36,6 +38,7 @@ import typer.testing
 
 from support.shares import left_out
 from support.stalls import Moment, Stalls, now
+from support.tools import to_install
 
 MEASURES = ("TooSlowError", "between", "within")
 """Names of `support.waiting` that a module imports whose tests measure times."""
@@ -138,6 +141,12 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     if report.failed and stalls is not None and BEGAN in item.stash:
         report.sections.append(("The machine meanwhile", stalls.told(item.stash[BEGAN])))
     return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """The last line: what lets the skipped tests run."""
+    if terminalreporter.stats.get("skipped") and (command := to_install()):
+        terminalreporter.write_line(f"some tests are skipped for want of a program: {command}")
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
