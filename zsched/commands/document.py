@@ -6,14 +6,11 @@ does to the fleet (`zsched.config.difference`), how it is agreed.
 
 from __future__ import annotations
 
-import os
-import shlex
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-from zsched import paths as places
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, warn
@@ -97,7 +94,7 @@ def document_text(held: InForce) -> str:
         CliError: none is agreed, or this node has not fetched it yet.
     """
     if not held.document:
-        advice = f"agree one: zsched apply {shlex.quote(str(places.config_path(None, os.environ)))}"
+        advice = "agree one: zsched apply FILE, the one by which the fleet runs (`zsched dev` has none to keep)"
         raise CliError(EXIT_FAILED, f"{held.fleet} goes by the file on each machine, and has no document yet; {advice}")
     if not held.text:
         advice = "ask another node with --node, or again in a moment"

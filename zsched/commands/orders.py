@@ -36,7 +36,7 @@ CODES: Final = {
 }
 ADVICE: Final = {
     "conflict": "; look at `zsched status`, then try again",
-    "no_quorum": "; nothing was changed, and `zsched status` shows which electors are away",
+    "no_quorum": "; nothing was changed, and `zsched status` tells why",
     "unknown": "; it may or may not have been agreed: `zsched status` shows which",
 }
 NOTHING: Final = "-"
@@ -135,8 +135,8 @@ def _counts(statuses: Sequence[Json], name: str) -> dict[str, int]:
 
 
 def told_losses(losses: Mapping[str, int | None]) -> str:
-    """What was lost and doubled, as the end of a line; empty: nobody has counted."""
-    return "" if losses["lost"] is None else f", lost {losses['lost']}, doubled {losses['doubled']}"
+    """What was lost, as the end of a line; empty: nobody has counted. What came twice was dropped, so nobody got it."""
+    return "" if losses["lost"] is None else f", lost {losses['lost']}"
 
 
 def check_name(status: Json, kind: str, name: str, known: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ from zsched.core.values.rehearsal import Promised, Step
 from zsched.screen import harmless, wrapped
 
 SCHEMA: Final = "zsched.rehearse/1"
-COUNTS: Final = ("lost", "at most lost", "doubled")
+COUNTS: Final = ("lost", "at most lost")
 LEFT_OUT: Final = "left out"
 HEADS: Final = ("STEP", "WHAT", "WHERE", "P50", "MAX", "N", "USUAL", "PROMISED", "RESULT")
 WHERE: Final = HEADS.index("WHERE")
@@ -101,7 +101,6 @@ def rows(results: Sequence[Result], promised: Mapping[Step, Promised]) -> Iterat
                 yield _row(step, what, "", known, None, limit)
         yield _counts(step, "lost", [one.lost for one in done], done, promise)
         yield _counts(step, "at most lost", [one.at_most_lost for one in done], done, None)
-        yield _counts(step, "doubled", [one.doubled for one in done], done, None)
 
 
 def _row(step: Step, what: str, where: str, values: Sequence[float], usual: float | None, limit: float | None) -> Json:

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from zsched.commands.page import (
+    DROPS_OVER_S,
     Cell,
     Page,
     cut,
     memory,
     missed_of,
     name_room,
-    none_for,
     short_name,
     short_span,
     since_drop,
@@ -542,7 +542,6 @@ def _route(page: Page, status: Json, task: Json) -> None:
         told = {
             "in flight": stream.get("in_flight"),
             "lost": stream.get("lost"),
-            "doubled": stream.get("doubled"),
             "out of order": stream.get("reordered"),
             "at most lost": stream.get("at_most_lost"),
             "repeated": stream.get("repeated"),
@@ -628,13 +627,14 @@ def all_problems(status: Json) -> list[str]:
 
 def troubles(page: Page, status: Json) -> None:
     """The last block: frames that were dropped, and the problems."""
-    dropped = [f"{name.removeprefix('dropped_')} {n}" for name, n in status["counters"].items() if "dropped_" in name]
-    problems, refused = all_problems(status), status.get("refused", ())  # a later field, as below
+    ages = status.get("dropped_ages", {})  # later fields of the schema's major version
+    found = [(name, n) for name, n in status["counters"].items() if "dropped_" in name]
+    dropped = [f"{name.removeprefix('dropped_')} {n}" for name, n in found if ages.get(name, 0.0) <= DROPS_OVER_S]
+    problems, refused = all_problems(status), status.get("refused", ())
     if dropped or refused or problems:
         page.lines.append("")
     if dropped:
-        over = none_for(status.get("frames_dropped_s"))  # a later field of the schema's major version
-        page.block("dropped", *((text, "") for text in dropped), *([(over.strip(" ()"), "dim")] if over else []))
+        page.block("dropped", *((text, "") for text in dropped))
     for number, text in enumerate(refused):
         page.block("" if number else "refused", (text, "yellow"))
     for number, problem in enumerate(problems):

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rhythm import HUNG_TIMES
 from zsched.core.executor.rollouts import waiting
+from zsched.core.gateway.company import is_full
+from zsched.core.gateway.shortfall import is_short
 from zsched.core.route.rates import STALE_S
 from zsched.core.scheduler.eligibility import is_of_machine, may_get
 from zsched.core.scheduler.judge import by
@@ -101,6 +103,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         problems=(
             *node.namesakes.problems(now),
             *_problems(node, quorum, now),
+            *_overloads(node, now),
             *_relay_problems(node, now),
             *node.knocking.problems(now, node.fleet_path, is_agreed=bool(node.agreement.document_hash)),
         ),
@@ -194,6 +197,15 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
+
+
+def _overloads(node: Stages, now: float) -> Iterator[str]:
+    """Each machine without free CPU where tasks visibly want more than they get."""
+    for profile in _heard(node, now):
+        short = [load.task for load in profile.workers if is_short(load)]
+        if short and is_full(profile):
+            used = f"{profile.cpu_used_cores:.3g} of {profile.cpu_cores:g} cores are in use"
+            yield f"{profile.node} is overloaded: {used}, too little is left for {', '.join(short)}"
 
 
 def _as_heard(node: Stages, names: Iterable[NodeId]) -> Iterator[str]:

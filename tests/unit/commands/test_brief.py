@@ -95,13 +95,14 @@ def test_a_moment_of_another_day_has_its_date() -> None:
     assert clock_time(NOON - 86400, NOON) == "03-03 12:00"
 
 
-def test_frames_that_were_dropped_long_ago_are_told_as_over() -> None:
+def test_frames_that_were_dropped_more_than_a_minute_ago_are_not_shown() -> None:
     status = recorded("healthy")
-    status["counters"] = {"dropped_beat_stale": 3}
-    assert "dropped    beat_stale 3\n" in render_brief(status, 100, color=False)
-    status["frames_dropped_s"] = 185.0
-    told = render_brief(status, 100, color=False)
-    assert "dropped    beat_stale 3 · none in the last minute, last 3m05s ago\n" in told
+    status["counters"] = {"dropped_data_link_stranger": 3, "dropped_beat_stale": 2}
+    assert "dropped    data_link_stranger 3 · beat_stale 2\n" in render_brief(status, 100, color=False)
+    status["dropped_ages"] = {"dropped_data_link_stranger": 61.0, "dropped_beat_stale": 59.0}
+    assert "dropped    beat_stale 2\n" in render_brief(status, 100, color=False)
+    status["dropped_ages"]["dropped_beat_stale"] = 61.0
+    assert "dropped" not in render_brief(status, 100, color=False)
 
 
 def test_who_is_not_let_in_is_told_and_is_no_problem() -> None:

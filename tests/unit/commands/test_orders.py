@@ -295,7 +295,7 @@ def test_a_move_waits_until_the_streams_have_settled_and_tells_what_was_measured
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()
     assert lines[2] == "It is agreed. Ctrl-C ends the watching, not the move."
-    assert lines[3] == "echo: settled on edge2, streams switched in 86 ms, lost 0, doubled 0"
+    assert lines[3] == "echo: settled on edge2, streams switched in 86 ms, lost 0"
     assert (daemon.orders[0]["origin"], daemon.orders[0]["target"]) == ("edge1", "edge2")
     body = json.loads(run("move", "echo", "edge1", "--yes", "--json").stdout)
     assert (faults(body), body["settled"], body["lost"], body["from"]) == ([], True, 0, "edge2")

@@ -812,6 +812,20 @@ def told_by(
 
 
 @pytest.mark.parametrize(
+    ("used_cores", "done_hz", "is_told"), [(4.0, 5.0, True), (4.0, 10.0, False), (2.0, 5.0, False), (None, 5.0, False)]
+)
+def test_a_machine_without_free_cpu_whose_task_gets_too_little_is_a_problem(
+    used_cores: float | None, done_hz: float, *, is_told: bool
+) -> None:
+    node = served()
+    load = load_of(state=WorkerState.READY, jobs=Jobs(time_s=0.1, cpu_s=0.1, wanted_hz=10.0, done_hz=done_hz))
+    profile = profile_of("edge1", incarnation=3, sequence=2, cpu_cores=4.0, cpu_used_cores=used_cores, workers=(load,))
+    node.handle(ev.ProfileReceived(profile=profile), 100.0)
+    said = "edge1 is overloaded: 4 of 4 cores are in use, too little is left for merge"
+    assert (said in build_snapshot(node, 100.0).problems) is is_told
+
+
+@pytest.mark.parametrize(
     ("unended_s", "jobs", "told"),
     [
         (12.0, Jobs(time_s=0.01, cpu_s=0.01, backlog=86), "12 s and finished no job, and 86 wait: it may hang"),

@@ -23,6 +23,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 from zsched.core.values.model import as_reason, told_by
 from zsched.core.values.struct import replace
+from zsched.core.values.words import told_of_silence
 
 MAX_OPEN = 16
 """Operators' commands that may wait for their documents; of more the oldest ends, and its operator is answered so."""
@@ -33,7 +34,7 @@ MAX_STORY = 500
 _ENDED = {
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
     RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "that is what is agreed"),
-    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
+    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, ""),
     RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
 }
 
@@ -142,6 +143,7 @@ class Orders:
             self._answer(request, CommandOutcome.OK, _committed(value), todo, value.revision)
             return
         kind, detail = _ENDED[outcome]
+        detail = detail or told_of_silence(len(value.electors))
         fault = self._numbers.fault(change) if outcome is RoundOutcome.UNCHANGED else ""
         if fault:
             kind, detail = CommandOutcome.INVALID, fault

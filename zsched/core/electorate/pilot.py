@@ -311,7 +311,7 @@ class Pilot:
         aim = min(TARGET, _odd(len(alive) + len(fit)))
         is_handed_on = count == 1 and value.electorate.names[0] in course.leaving
         if not fit or (count >= aim and not is_handed_on):
-            return _none(f"{count} electors, {len(alive)} alive, {len(fit)} to spare")
+            return _none(f"{count} electors, {len(alive)} alive, {len(fit)} more could be one")
         if count > 1 and len(alive) < majority(count + 1):
             return _none(f"no room for {fit[0]}: {len(alive)} of then {count + 1} electors are sure to answer")
         name = fit[0]

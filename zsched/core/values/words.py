@@ -69,6 +69,12 @@ def meant(number: int | None, now: int) -> int:
     return number if number >= CREATION_STEP else now - shown(now) + number
 
 
+def told_of_silence(electors: int) -> str:
+    """Why a change has no majority: the only elector is this machine, which others' silence does not concern."""
+    alone = "this machine is overloaded, or its disk is slow: its own vote came too late"
+    return alone if electors == 1 else "no majority of the electors answered"
+
+
 def told_of_worker(state: str, reason: str) -> str:
     """The state of a worker (`zsched.core.values.profile.WorkerState`) in words, to follow its name."""
     if state != _READY and reason.startswith(WAS_READY):

@@ -852,7 +852,7 @@ class Agreement:
         if isinstance(change, MoveOwner):
             text = f"move to {change.owner} on revision {shown(change.base_revision)}: {outcome}"
             todo.add(do.RecordStory(stage="vote", text=text, task=task, epoch=value.epoch))
-        answer_end(ended, value, todo)
+        answer_end(ended, value, todo, len(self._fleet.electors))
 
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""

@@ -15,13 +15,13 @@ from zsched.core.values.change import Ended, Retune, RoundOutcome, SetLeased
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import Allocation, TaskId, Weights
 from zsched.core.values.struct import replace
-from zsched.core.values.words import shown
+from zsched.core.values.words import shown, told_of_silence
 
 _ENDED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
     RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
     RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
-    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, "no majority of the electors answered"),
+    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, ""),
     RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
 }
 
@@ -57,11 +57,12 @@ def refuse_gone(ended: Ended, todo: ToDo) -> None:
         _refuse(ended.change.request, CommandOutcome.INVALID, f"{ended.task} has left the fleet", todo)
 
 
-def answer_end(ended: Ended, value: Allocation, todo: ToDo) -> None:
-    """Tell the operator who waits for a change how it has ended; ``value`` is the present one."""
+def answer_end(ended: Ended, value: Allocation, todo: ToDo, electors: int) -> None:
+    """Tell the operator who waits for a change how it has ended; ``value`` is the present one, of so many electors."""
     if not isinstance(ended.change, SetLeased) and ended.change.request is not None:
         kind, detail = _ENDED[ended.outcome]
-        result = CommandResult(outcome=kind, detail=f"{ended.task}: {detail}", revision=value.revision)
+        told = f"{ended.task}: {detail or told_of_silence(electors)}"
+        result = CommandResult(outcome=kind, detail=told, revision=value.revision)
         todo.add(do.AnswerCommand(request=ended.change.request, result=result))
 
 

@@ -281,7 +281,7 @@ def test_a_node_that_may_be_gone_becomes_no_elector() -> None:
     ear.hear("bx", STEADY * T + 1.0)
     assert ear.wish == "+x/78"
     ear.hear("b", 4.0)
-    assert ear.wish == "2 electors, 2 alive, 0 to spare"
+    assert ear.wish == "2 electors, 2 alive, 0 more could be one"
     ear.hear("bx", 1.0)
     assert ear.wish == "+x/78"
 
@@ -298,7 +298,7 @@ def test_whom_a_pilot_that_has_just_started_never_heard_is_not_counted_on() -> N
 def test_a_single_elector_that_leaves_hands_its_seat_to_one_that_is_fit() -> None:
     ear = Ear(value("a"))
     ear.hear("x", STEADY * T + 1.0)
-    assert ear.wish == "1 electors, 1 alive, 1 to spare", "two are no better than one"
+    assert ear.wish == "1 electors, 1 alive, 1 more could be one", "two are no better than one"
     ear.course = replace(COURSE, leaving=("a",))
     assert ear.wish == f"+x/{disk_of('x')}"
     ear.value = value("ax", number=4, revision=8)
@@ -326,19 +326,19 @@ def test_a_leaver_stays_until_it_has_learnt_a_settled_value_without_it() -> None
 def test_a_candidate_was_heard_without_a_break_for_several_silences() -> None:
     ear = Ear(value("abcd"))
     ear.hear("bcdx", STEADY * T)
-    assert ear.wish == "4 electors, 4 alive, 0 to spare"
+    assert ear.wish == "4 electors, 4 alive, 0 more could be one"
     ear.hear("bcdx", 1.0)
     assert ear.wish == f"+x/{disk_of('x')}"
     ear.hear("bcd", T)
-    assert ear.wish == "4 electors, 4 alive, 0 to spare", "it is silent"
+    assert ear.wish == "4 electors, 4 alive, 0 more could be one", "it is silent"
     ear.hear("bcdx", T)
-    assert ear.wish == "4 electors, 4 alive, 0 to spare", "and begins again"
+    assert ear.wish == "4 electors, 4 alive, 0 more could be one", "and begins again"
 
 
 def test_who_leaves_is_no_candidate_until_its_flag_is_taken_back() -> None:
     ear = Ear(value("abcd"), replace(COURSE, leaving=("x",)))
     ear.hear("bcdx", STEADY * T + 1.0)
-    assert ear.wish == "4 electors, 4 alive, 0 to spare"
+    assert ear.wish == "4 electors, 4 alive, 0 more could be one"
     ear.hear("bcdxy", STEADY * T + 1.0)
     assert ear.wish == f"+y/{disk_of('y')}", "x was heard for longer"
     ear.course = COURSE
@@ -360,14 +360,14 @@ def test_a_candidate_shows_the_present_number_and_a_disk(word: dict[str, object]
     for _ in range(int(STEADY * T) + 2):
         ear.hear("bcd", 1.0)
         ear.say("x", **word)
-    assert ear.wish == "4 electors, 4 alive, 0 to spare"
+    assert ear.wish == "4 electors, 4 alive, 0 more could be one"
 
 
 def test_a_candidate_is_added_with_the_disk_of_its_newest_beat() -> None:
     ear = Ear(value("abcd"))
     ear.hear("bcdx", STEADY * T)
     ear.hear("bcdx", 2.0, disk="77")
-    assert "0 to spare" in ear.wish, "another disk is another member: it is not steady yet"
+    assert "0 more could be one" in ear.wish, "another disk is another member: it is not steady yet"
     for _ in range(int(STEADY * T)):
         ear.hear("bcd", 1.0)
         ear.say("x", disk="77")
@@ -386,7 +386,7 @@ def test_add_only_with_room_for_one_that_never_answers() -> None:
 def test_one_elector_has_no_room_for_a_second() -> None:
     ear = Ear(value("a"))
     ear.hear("x", STEADY * T + 1.0)
-    assert ear.wish == "1 electors, 1 alive, 1 to spare", "two are no better than one"
+    assert ear.wish == "1 electors, 1 alive, 1 more could be one", "two are no better than one"
 
 
 def test_one_elector_becomes_three_over_two_when_two_nodes_are_fit() -> None:
@@ -402,7 +402,7 @@ def test_one_elector_becomes_three_over_two_when_two_nodes_are_fit() -> None:
 def test_an_elector_whose_second_came_without_a_third_waits_for_one() -> None:
     ear = Ear(value("ax"))
     ear.hear("x", STEADY * T + 1.0)
-    assert ear.wish == "2 electors, 2 alive, 0 to spare"
+    assert ear.wish == "2 electors, 2 alive, 0 more could be one"
 
 
 @pytest.mark.parametrize(
@@ -418,7 +418,7 @@ def test_the_aim_is_five() -> None:
     ear = Ear(value("abcde"))
     ear.hear("bcdexy", STEADY * T + 1.0)
     assert TARGET == 5
-    assert ear.wish == "5 electors, 5 alive, 2 to spare"
+    assert ear.wish == "5 electors, 5 alive, 2 more could be one"
 
 
 def test_spread_over_robots_and_edges_then_the_steadiest() -> None:

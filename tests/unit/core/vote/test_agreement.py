@@ -21,6 +21,7 @@ from zsched.core.electorate.strangers import SHOWN_S
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner, Retune, SetHold, SetLeased
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -48,10 +49,10 @@ FLEET = fleet_of(
 ADA = Asked(by="ada@robot1")
 
 
-def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True) -> Agreement:
+def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True, fleet: Fleet = FLEET) -> Agreement:
     state = state_of(me, *registers, hardware="h")
     agreement = Agreement(
-        fleet=FLEET,
+        fleet=fleet,
         me=me,
         durable=state if has_state else None,
         incarnation=7,
@@ -185,6 +186,14 @@ def test_command_without_a_majority_of_promises_ends_as_no_quorum() -> None:
     promise = Promise(elector="robot1", task="merge", ballot=asked.prepare.ballot)
     effects = agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 100.0)
     assert run_dry(agreement, effects).outcome is CommandOutcome.NO_QUORUM
+
+
+def test_the_only_elector_s_own_vote_that_comes_too_late_is_told_as_overload_and_no_lack_of_others() -> None:
+    alone = fleet_of(task_of("merge", ("edge1", "robot2")), of=("edge1", *ROBOTS), electors=ROBOTS[:1])
+    for fleet, says in ((FLEET, "no majority of the electors answered"), (alone, "this machine is overloaded")):
+        agreement = make(fleet=fleet)
+        result = run_dry(agreement, agreed(agreement.retune, command(), 100.0))
+        assert (result.outcome, says in result.detail) == (CommandOutcome.NO_QUORUM, True), result.detail
 
 
 def test_command_whose_accept_left_and_was_not_answered_ends_as_unknown() -> None:
