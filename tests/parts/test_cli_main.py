@@ -112,9 +112,29 @@ def test_up_with_a_state_folder_of_others_leaves_the_word_to_the_daemon(
     os.seteuid(65534)
     try:
         result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-        with pytest.raises(AdapterError, match=r"the state folder \S+: Permission denied; check its owner"):
+        with pytest.raises(AdapterError, match=r"the state folder \S+: Permission denied; run this by sudo"):
             StateFile(tmp_path / "state", fleet="testbed", node="robot1").acquire()
     finally:
         os.seteuid(0)
     assert result.exit_code == 0
     assert "zsched.daemon" in started[0]
+
+
+@pytest.mark.root
+def test_a_folder_without_permission_is_one_line_with_a_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(0o700)
+    for folder in (tmp_path, *tmp_path.parents):
+        if "pytest" in folder.as_posix():
+            folder.chmod(0o755)
+    monkeypatch.chdir(closed)
+    CliRunner().invoke(app, ["dev", "none.yaml"])  # what it loads is root's
+    os.seteuid(65534)
+    try:
+        result = CliRunner().invoke(app, ["dev"])
+    finally:
+        os.seteuid(0)
+    assert (result.exit_code, len(result.stderr.splitlines())) == (1, 1), result.output
+    assert result.stderr.startswith("zsched dev: fleet.yaml: Permission denied; run this by sudo")

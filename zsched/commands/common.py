@@ -208,6 +208,8 @@ class Verbs(TyperGroup):
         except WireError as error:
             advice = "update the older of the two, zsched here or the daemon"
             code, text = EXIT_FAILED, f"a daemon's answer cannot be read ({error}); {advice}"
+        except PermissionError as error:
+            code, text = EXIT_FAILED, f"{error.filename}: {error.strerror}; run this by sudo, or from another folder"
         # a fleet file's faults start with its name, like a compiler's: nothing goes in front of them
         prefix = "" if code == EXIT_CONFIG else f"{ctx.command_path} {ctx.invoked_subcommand}: "
         warn(f"{prefix}{text}")

@@ -140,6 +140,8 @@ _MEANT: Final = {
     "wireless": "wifi",
     "lan": "wired",
     "ethernet": "wired",
+    "cpu": "cpu_cores",
+    "memory": "memory_mb",
     "docker": "container",
     "podman": "container",
 }

@@ -158,10 +158,10 @@ def _certificate(name: str, path: Path, now: datetime, soon: timedelta, fix: str
     except (OSError, ValueError) as error:
         return failed(f"{path}: {getattr(error, 'strerror', None) or error}", fix=fix)
     told = f"{path} is valid from {begins:%Y-%m-%d} to {ends:%Y-%m-%d}"
-    if now > ends:
-        return failed(f"{told}: it has ended", fix=fix)
-    if now < begins:
-        return failed(f"{told}: it has not begun", fix=f"is this machine's clock right (timedatectl)? Else {fix}")
+    if not begins <= now <= ends:
+        what = "has ended" if now > ends else "has not begun"
+        clock = f"is this machine's clock right (timedatectl), by which it is {now:%Y-%m-%d}? If so, {fix}"
+        return failed(f"{told}: it {what}", fix=clock)
     return warned(f"{told}: {(ends - now).days} days are left", fix=fix) if ends - now < soon else passed(told)
 
 

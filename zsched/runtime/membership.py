@@ -865,7 +865,7 @@ def _told_of(path: Path) -> Iterator[None]:
 
 def _advice(error: OSError, path: Path) -> str:
     if error.errno in (errno.EACCES, errno.EPERM):
-        return "run this as root, or give places of your own with --config and --state-dir"
+        return "run this by sudo, or give places of your own with --config and --state-dir"
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO):
         return "free or remount the disk, then give the command again"
     return f"look what is at {error.filename or path}, move it away, then give the command again"

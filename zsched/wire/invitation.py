@@ -86,6 +86,8 @@ def decode_invitation(data: bytes) -> Invitation:
     """
     if len(data) > MAX_BYTES:
         raise WireError("size", f"{len(data)} bytes, at most {MAX_BYTES}")
+    if not data.strip():
+        raise WireError("size", "it is empty: the command that was to write it was refused")
     try:
         body = json.loads(data)
     except (ValueError, RecursionError) as error:

@@ -613,8 +613,10 @@ def test_the_machine_of_an_invitation_has_all_files_and_a_second_time_nothing_to
 
 def test_what_is_no_invitation_is_refused(tmp_path: Path) -> None:
     (tmp_path / "text").write_text("hello")
+    (tmp_path / "empty").touch()
     for file, why in (
         (tmp_path / "text", "no whole JSON"),
+        (tmp_path / "empty", "it is empty: the command that was to write it was refused"),
         (tmp_path / "none", "No such file"),
         (tmp_path, "a folder"),
     ):

@@ -620,6 +620,7 @@ ONE_FAULT = [
     ("candidates: {kind: edge}", "candidates: edge1", "expected", "edge1\n"),
     ("network: 0.0", "network: 0.1", "the sum is 1.1, not 1", "{cpu: 0.5"),
     ("network: 0.0", "network: 0.0, netwrk: 1", "has no key 'netwrk'", "netwrk"),
+    ("cpu_cores: 0.4", "cpu: 0.4", "a demand has no key 'cpu'", "cpu: 0.4"),
     ("cpu_cores: 0.4", "cpu_cores: .nan", "expected a number", ".nan"),
     ("cpu_cores: 0.4", 'cpu_cores: "0.4"', "expected a number", '"0.4"'),
     ("bonus: 0.10,", "bonus: 0.10, bonus: 0.2,", "the key 'bonus' is there twice", "bonus: 0.2"),

@@ -77,8 +77,9 @@ class StateFile:
             self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             fd = _open_own(self.folder / LOCK_NAME)
         except OSError as error:
-            is_file = error.errno in (errno.EEXIST, errno.ENOTDIR)
-            advice = "a file is where a folder should be: see --state-dir" if is_file else "check its owner"
+            advice = "run this by sudo, or give --state-dir"
+            if error.errno in (errno.EEXIST, errno.ENOTDIR):
+                advice = "a file is where a folder should be: see --state-dir"
             if error.errno in (errno.ENOENT, errno.EROFS):
                 advice = "name a folder that can be made with --state-dir"
             if error.errno in (errno.ELOOP, errno.EMLINK):

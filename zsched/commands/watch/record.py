@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -179,7 +180,7 @@ def _taped(path: Path, kinds: dict[str, str]) -> Iterator[Tape]:
         from mcap.writer import Writer  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise CliError(
-            EXIT_FAILED, "MCAP cannot be written here: install the extra mcap, as docs/guide/observe.md says"
+            EXIT_FAILED, f"MCAP cannot be written here: {sys.executable} -m pip install 'zsched[mcap]'"
         ) from error
     try:
         file: BinaryIO = path.open("xb")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import re
 import secrets
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -119,7 +120,7 @@ class Sender:
         except ImportError as error:
             raise CliError(
                 EXIT_FAILED,
-                "OpenTelemetry is not installed here: install the extra trace, as docs/guide/observe.md says",
+                f"OpenTelemetry is not installed here: {sys.executable} -m pip install 'zsched[trace]'",
             ) from error
 
         class Named(IdGenerator):

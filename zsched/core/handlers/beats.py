@@ -212,7 +212,7 @@ def _heed(node: Stages, verdict: Verdict, todo: ToDo, now: float) -> None:
         return
     complaint = _complain(node, now)
     if verdict is Verdict.LEAVE:
-        todo.stand_down = do.StandDown(reason=f"{complaint}; stop it, or give this machine a name of its own")
+        todo.stand_down = do.StandDown(reason=complaint)
     elif verdict is Verdict.DISPUTE:
         node.agreement.dispute(complaint, todo)
 

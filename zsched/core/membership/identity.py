@@ -77,11 +77,14 @@ class Identity(Struct):
 
     def complaint(self, now: float) -> str | None:
         """The complaint that status shows; ``None``: nobody else uses the name."""
-        if self._tokens:
-            return f"another daemon calls itself {self.me!r}"
         peer, told_at = self._told
-        if now < told_at + QUIET_S:
-            return f"another daemon calls itself {self.me!r}: {peer} hears it"
+        is_told = now < told_at + QUIET_S
+        if self._tokens or is_told:
+            heard, asked = (f": {peer} hears it", peer) if is_told else ("", "NODE")
+            return (
+                f"another daemon calls itself {self.me!r}{heard}; stop it, or give this machine a name of its own "
+                f"(`zsched status --node {asked}` shows the addresses of both)"
+            )
         if now < self._heard_at + QUIET_S:
             return f"somebody sends beats in the name of {self.me!r}, and no daemon of that name is seen"
         return None

@@ -226,4 +226,4 @@ def test_without_the_library_it_says_what_to_install(folder: Path, monkeypatch: 
     assert folder.exists()
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
     refused = CliRunner().invoke(app, ["trace", "--once"])
-    assert (refused.exit_code, "install the extra" in refused.stderr) == (1, True)
+    assert (refused.exit_code, "-m pip install 'zsched[trace]'" in refused.stderr) == (1, True)

@@ -171,5 +171,5 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(folder: Path, mo
     assert run("-o", folder / "none" / "x.mcap").exit_code == 1
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     refused = run("-o", file)
-    assert (refused.exit_code, "install the extra" in refused.stderr) == (1, True)
+    assert (refused.exit_code, "-m pip install 'zsched[mcap]'" in refused.stderr) == (1, True)
     assert not file.exists()
