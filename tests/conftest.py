@@ -6,7 +6,7 @@ that a test starts would inherit that, and tests of Ctrl-C would wait for ever. 
 A test that finds a measured time too long is run up to three times: a machine is busy once, a fault is slow each time.
 Only tests of modules that measure times are marked for that: it costs a marked test 40 ms beside other processes.
 
-Behind skipped tests stands what to install for them (`support.tools`).
+The end of a run with skipped tests says what to install for them (`support.tools`).
 
 Below a red test with real processes stands how the machine was meanwhile (`support.stalls`).
 

@@ -120,7 +120,7 @@ def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
             assert done.returncode == 0, (words, done.stderr)
             if words[0] == "drain":  # the task moves away; an order in the middle of that is a conflict
                 bed.wait(lambda: bed.task("robot1")["owner"] == "edge2", 60, "the drained node has handed over")
-        assert zsched(bed, "robot1", "eligible", "robot2", "off", "--yes").returncode == 0
+        assert zsched(bed, "robot1", "drain", "robot2", "--only", "new", "--yes").returncode == 0
         user = f"{user_name()}@robot1"
         drained, closed = ("edge1", "drain"), ("robot2", "ineligible")
         bed.wait(
@@ -140,7 +140,7 @@ def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
         assert answer["outcome"] == "ok", answer
         wanted = {drained: "ana.operator", closed: "ana.operator"}
         bed.wait(lambda: flags_at(bed, "robot2") == wanted, 60, "no flag in another's name")
-        listed = zsched(bed, "robot2", "maint").stdout
+        listed = zsched(bed, "robot2", "status").stdout
         assert listed.count("ana.operator") == 3, listed
         assert "bob@robot1" not in listed
 
@@ -154,7 +154,7 @@ def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
                 == [
                     ("ana.operator", f"ana.operator (the first): apply {tmp_path / 'ana' / 'fleet.yaml'}"),
                     ("ana.operator", "ana.operator (new fan): drain edge1"),
-                    (user, f"{user}: eligible off robot2"),
+                    (user, f"{user}: ineligible robot2"),
                     ("ana.operator", "ana.operator: nothing, by bob@robot1"),
                 ]
             ),

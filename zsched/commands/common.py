@@ -33,7 +33,7 @@ NAMED_OTHERWISE: Final = {
     **dict.fromkeys(("fleet.create", "join", "leave"), "member"),
     "tune": "tuning",
     **dict.fromkeys(("pin", "unpin", "pause", "resume"), "task"),
-    **dict.fromkeys(("undrain", "eligible"), "drain"),
+    "undrain": "drain",
 }
 OBEYED: Final = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What JSON leaves as it is and a terminal may obey: more controls, turns of the writing, halves of characters."""

@@ -5,6 +5,7 @@ Knows: options. Does not know: how anything is done (`zsched.commands.flags`, im
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -15,12 +16,22 @@ from zsched.commands.options import AskedOption, ConnectOption, JsonOption, Plan
 from zsched.commands.order_verbs import ForOption, ReasonOption, order_view
 from zsched.exits import EXIT_USAGE
 
+
+class Only(StrEnum):
+    """What a drain keeps from nodes."""
+
+    NEW = "new"
+
+
 NodesArgument = Annotated[list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes of the fleet.")]
 
 
 def drain(
     nodes: NodesArgument = None,
     self_: Annotated[bool, typer.Option("--self", help="The node that is asked.")] = False,
+    only: Annotated[
+        Only | None, typer.Option("--only", metavar="new", help="new: they get nothing new, and keep what they own.")
+    ] = None,
     for_: ForOption = None,
     deadline: Annotated[
         str, typer.Option("--deadline", metavar="DURATION", help="How long to watch: 90s, 10m, 2h.")
@@ -45,7 +56,7 @@ def drain(
     `zsched undrain`. A task that nobody else can have stays. Without nodes it lists the drained ones. Exits with 5 at
     the deadline; the drain goes on all the same.
     """
-    from zsched.commands.flags import DrainOrder  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.flags import DRAIN, INELIGIBLE, DrainOrder  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.flags import drain as give  # noqa: PLC0415 - as above
     from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
 
@@ -54,9 +65,10 @@ def drain(
     order = DrainOrder(
         nodes=tuple(nodes or ()),
         is_self=self_,
-        is_detached=detach,
+        is_detached=detach or only is Only.NEW,
         deadline_s=None if force else duration_s(deadline),
         accepted=tuple(accept or ()),
+        kind=DRAIN if only is None else INELIGIBLE,
     )
     view = order_view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, order))
@@ -75,7 +87,7 @@ def undrain(
     runtime_dir: RuntimeOption = None,
     connect: ConnectOption = None,
 ) -> None:
-    """End the drain of nodes: they may get tasks again, when the fleet finds them better.
+    """End every drain of nodes: they may get tasks again, when the fleet finds them better.
 
     Without a node it lists those that are drained.
     """
@@ -83,27 +95,3 @@ def undrain(
 
     view = order_view(node, runtime_dir, connect, reason, revision, None, json_=json_, yes=yes, plan=plan)
     raise typer.Exit(give(view, nodes or ()))
-
-
-def eligible(
-    name: Annotated[str | None, typer.Argument(metavar="[NODE]", help="A node; without it: list.")] = None,
-    word: Annotated[str | None, typer.Argument(metavar="[on|off]", help="off: nothing new.")] = None,
-    for_: ForOption = None,
-    accept: AcceptOption = None,
-    reason: ReasonOption = "",
-    revision: RevisionOption = None,
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
-    """Keep new tasks from a node (off), or let it get tasks again (on). What it owns stays there.
-
-    Without a node it lists those that get nothing new.
-    """
-    from zsched.commands.flags import eligible as give  # noqa: PLC0415 - each verb imports what it needs
-
-    view = order_view(node, runtime_dir, connect, reason, revision, for_, json_=json_, yes=yes, plan=plan)
-    raise typer.Exit(give(view, name, word, tuple(accept or ())))

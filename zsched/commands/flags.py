@@ -1,4 +1,4 @@
-"""`zsched drain`, `undrain` and `eligible`: shows what a flag changes, has it agreed, and watches a node become empty.
+"""`zsched drain` and `undrain`: shows what a flag changes, has it agreed, and watches a node become empty.
 
 Knows: how flags are shown before and after, the danger in one, when a node is empty. Does not know: how a document is
 agreed (`zsched.commands.document`), what a robot makes of a flag (`zsched.core.scheduler.flags`).
@@ -38,8 +38,6 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA: Final = "zsched.drain/1"
 DRAIN, INELIGIBLE, LEAVE = "drain", "ineligible", "leave"
-ENDS: Final = {DRAIN: (DRAIN, LEAVE), INELIGIBLE: (INELIGIBLE,)}
-"""{flag: which ones go when it is taken back}: a node that is not drained any more does not leave, either."""
 PAUSE_S: Final = 0.2
 """Between two looks at a node that is drained."""
 STAYS_S: Final = 3.0
@@ -66,7 +64,7 @@ class DrainOrder(Struct, frozen=True, kw_only=True):
     accepted: tuple[str, ...] = ()
     """Names of dangers."""
     kind: str = DRAIN
-    """``LEAVE``: they give up their seats among the electors, too."""
+    """``LEAVE``: they give up their seats among the electors, too. ``INELIGIBLE``: they keep what they own."""
     more_rows: tuple[Row, ...] = ()
     """What else follows, in the table of what changes."""
     is_shown: bool = False
@@ -103,10 +101,11 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     status = _status(view.door)
     nodes = _chosen(status, order)
     if not nodes:
-        return _list(view, status, DRAIN)
+        return _list(view, status)
     held = _held(view)
     after = _with(view, held, order.kind, nodes)
-    rows = [*(_row(status, name, order.kind, after) for name in nodes), *_task_rows(status, nodes, after)]
+    rows = [_row(status, name, order.kind, after) for name in nodes]
+    rows += [] if order.kind == INELIGIBLE else _task_rows(status, nodes, after)
     danger = _check_dangers(view, order.accepted, status, held.flags, after)
     owned = [row[0] for row in rows if row[1] == "owner"]
     plan = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=danger)
@@ -133,53 +132,30 @@ def drain(view: OrderView, order: DrainOrder) -> int:
 
 
 def undrain(view: OrderView, nodes: Sequence[str]) -> int:
-    """End the drain of nodes; returns the exit code.
+    """Take every flag off nodes; returns the exit code.
 
     Raises:
         CliError: as of `drain`.
     """
     if not nodes:
-        return _list(view, _status(view.door), DRAIN)
-    return _set(view, DRAIN, tuple(dict.fromkeys(nodes)), is_on=False)
-
-
-def eligible(view: OrderView, node: str | None, word: str | None, accepted: tuple[str, ...]) -> int:
-    """Let a node get tasks, or nothing new; without a node list those that get nothing new; returns the exit code.
-
-    Raises:
-        CliError: as of `drain`, or the word is neither on nor off.
-    """
-    if node is None:
-        return _list(view, _status(view.door), INELIGIBLE)
-    if word not in ("on", "off"):
-        raise CliError(EXIT_USAGE, f"say on or off: `zsched eligible {node} off`")
-    if word == "on" and view.for_s is not None:
-        raise CliError(EXIT_USAGE, f"--for goes with off: `zsched eligible {node} off --for 10m` ends by itself")
-    return _set(view, INELIGIBLE, (node,), is_on=word == "off", accepted=accepted)
-
-
-def _set(view: OrderView, kind: str, nodes: tuple[str, ...], *, is_on: bool, accepted: tuple[str, ...] = ()) -> int:
+        return _list(view, _status(view.door))
     check_said(view)
     status = _status(view.door)
     _check_nodes(status, nodes)
     held = _held(view)
-    after = _with(view, held, kind, nodes) if is_on else _without(held, kind, nodes)
-    danger = _check_dangers(view, accepted, status, held.flags, after) if is_on else None
-    rows = [_row(status, name, one, after) for name in nodes for one in _shown(status, name, kind)]
-    plan = _body("planned", nodes=nodes, revision=held.revision, reason=danger)
+    after = tuple(flag for flag in held.flags if flag["subject"] not in nodes)
+    gone = {name: [str(flag["kind"]) for flag in held.flags if flag["subject"] == name] for name in nodes}
+    rows = [_row(status, name, kind, after) for name, kinds in gone.items() for kind in kinds or [DRAIN]]
+    plan = _body("planned", nodes=nodes, revision=held.revision)
     code = begin(view, rows, plan, is_change=after != held.flags, titles=TITLES, is_line=True)
     if code is not None:
         return code
     if after == held.flags:
         return tell(view, "unchanged", "Nothing would change.", nodes=nodes, revision=held.revision)
-    verb = "eligible off" if is_on else "undrain" if kind == DRAIN else "eligible on"
-    revision = _commit(view, held, after, f"{verb} {', '.join(nodes)}")
-    left = [name for name in nodes if not is_on and any(flag["subject"] == name for flag in after)]
-    more = "".join(f" {name} still gets nothing new: `zsched {_way_out(after, name)}`." for name in left)
-    gone = _seats_lost(view.door, held, nodes) if kind == DRAIN and not is_on else []
-    more += "".join(f" {lack}." for lack in gone)
-    text = f"It is agreed{_endless(held.flags, after)}.{more}"
-    return tell(view, "agreed", text, after_s=0.0, nodes=nodes, revision=revision, missing=gone)
+    revision = _commit(view, held, after, f"undrain {', '.join(gone)}")
+    lost = _seats_lost(view.door, held, nodes)
+    text = f"It is agreed.{''.join(f' {lack}.' for lack in lost)}"
+    return tell(view, "agreed", text, after_s=0.0, nodes=nodes, revision=revision, missing=lost)
 
 
 def _seats_lost(door: Door, held: InForce, nodes: Sequence[str]) -> list[str]:
@@ -208,11 +184,6 @@ def _endless(before: Sequence[Json], after: Sequence[Json]) -> str:
     return f", and ends by hand only ({told})" if told else ""
 
 
-def _way_out(flags: Sequence[Json], name: str) -> str:
-    is_drained = any(flag["subject"] == name and flag["kind"] in ENDS[DRAIN] for flag in flags)
-    return f"undrain {name}" if is_drained else f"eligible {name} on"
-
-
 # --- what is shown ---------------------------------------------------------------------------------------------------
 
 
@@ -230,28 +201,15 @@ def _body(event: str, **more: Any) -> Json:
     return {**body, **more, "nodes": list(more.get("nodes", ()))}
 
 
-def _list(view: OrderView, status: Json, kind: str) -> int:
-    found = [
-        (str(node["name"]), flag)
-        for node in status["nodes"]
-        for flag in node.get("flags", ())
-        if flag["kind"] in ENDS[kind]
-    ]
+def _list(view: OrderView, status: Json) -> int:
+    found = [(str(node["name"]), flag) for node in status["nodes"] for flag in node.get("flags", ())]
     if not found and not view.is_json:
-        word = "drained" if kind == DRAIN else "kept from getting tasks"
-        say(f"no node is {word}, as {status['node']} knows")
+        say(f"no node is drained, as {status['node']} knows")
     for name, flag in found:
         text = f"{name}: {told_flag(flag)}, known for {span(flag['known_s'])}"
         told = {key: flag[key] for key in ("by", "reason", "known_s", "for_s")}
         tell(view, "listed", text, node=name, nodes=[name], **told)
     return EXIT_OK
-
-
-def _shown(status: Json, name: str, kind: str) -> tuple[str, ...]:
-    """The kinds of flags of a node that a row is about: this one, and what goes with it if the node has it."""
-    node = next(node for node in status["nodes"] if node["name"] == name)
-    has = {flag["kind"] for flag in node.get("flags", ())}
-    return tuple(one for one in ENDS[kind] if one in has) or (kind,)
 
 
 def _row(status: Json, name: str, kind: str, after: Sequence[Json]) -> tuple[str, str, str, str]:
@@ -331,10 +289,6 @@ def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tu
     return tuple(sorted(flags, key=lambda flag: (flag["subject"], flag["kind"])))
 
 
-def _without(held: InForce, kind: str, nodes: Sequence[str]) -> tuple[Json, ...]:
-    return tuple(flag for flag in held.flags if flag["kind"] not in ENDS[kind] or flag["subject"] not in nodes)
-
-
 def _check_dangers(
     view: OrderView, accepted: Sequence[str], status: Json, before: Sequence[Json], after: Sequence[Json]
 ) -> str | None:
@@ -382,7 +336,7 @@ def drain_quietly(view: OrderView, node: str) -> int:
     """
     held = _held(view)
     if any(flag["subject"] == node for flag in held.flags):
-        raise CliError(EXIT_FAILED, f"{node} has an order already; see `zsched maint`")
+        raise CliError(EXIT_FAILED, f"{node} has an order already; see `zsched status`")
     return _commit(view, held, _with(view, held, DRAIN, [node]), f"drain {node}")
 
 

@@ -195,19 +195,6 @@ def restart(
     )
 
 
-def maint(
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
-    """List pins, pauses and flags in force with author and reason, and the nodes that stop (tunings: `tune`)."""
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.maint import maint as show  # noqa: PLC0415 - as above
-
-    raise typer.Exit(show(find_door(runtime_dir, node, connect=connect), is_json=json_))
-
-
 def order_view(
     node: str | None,
     runtime_dir: Path | None,

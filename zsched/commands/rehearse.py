@@ -508,7 +508,7 @@ class Stage:
             return ""
         why = why or "it takes too long"
         ends = f"it ends by itself within {self._drains.for_s or 0.0:.0f} s"
-        return f"a node may still be drained: {why}; `zsched maint` tells, and {ends}"
+        return f"a node may still be drained: {why}; `zsched status` tells, and {ends}"
 
     def _lifted(self) -> tuple[str, bool]:
         """(why the drains cannot be ended now, whether there were any)."""

@@ -83,10 +83,10 @@ def nodes_get_tasks(scene: Scene) -> Result:
     for task in status["tasks"]:
         if closed.issuperset(task["candidates"]):
             told = f"{task['name']}: no candidate may get it any more; when its owner ends, nobody does it"
-            found.append(failed(told, fix="zsched undrain, or zsched eligible NODE on, for one of its candidates"))
+            found.append(failed(told, fix="zsched undrain NODE, for one of its candidates"))
     lines = [f"{name} {_told(name, flag)}, known here for {flag['known_s']:.0f} s" for name, flag in flags]
     if lines:
-        fix = "where the work is done: zsched undrain NODE, zsched eligible NODE on"
+        fix = "where the work is done: zsched undrain NODE"
         found.append(warned(*lines, fix=fix))
     return joined(found, passed("every node may get tasks"))
 

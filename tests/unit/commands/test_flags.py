@@ -1,4 +1,4 @@
-"""`zsched drain`, `undrain`, `eligible`: what they show and ask, what a daemon is told, how a drain is watched."""
+"""`zsched drain`, `undrain`: what they show and ask, what a daemon is told, how a drain is watched."""
 
 from __future__ import annotations
 
@@ -151,11 +151,11 @@ def test_a_drain_without_a_time_ends_by_hand_only_also_where_one_had_a_time(daem
     assert (flag["for_s"], flag["reason"]) == (None, "new fan")
     assert "Nothing would change" in run("drain", "edge1", "--yes").stdout
     assert run("undrain", "edge1", "--yes").exit_code == 0
-    run("eligible", "edge2", "off", "--for", "30s", "--yes")
-    assert "ends by hand only (edge2, was for 30s)." in run("eligible", "edge2", "off", "--yes").stdout
+    run("drain", "edge2", "--only", "new", "--for", "30s", "--yes")
+    assert "ends by hand only (edge2, was for 30s)." in run("drain", "edge2", "--only", "new", "--yes").stdout
 
 
-@pytest.mark.parametrize("words", [("drain", "edge1"), ("eligible", "edge1", "off")])
+@pytest.mark.parametrize("words", [("drain", "edge1"), ("drain", "edge1", "--only", "new")])
 def test_off_a_terminal_nothing_is_done_and_the_command_is_printed(daemon: Daemon, words: tuple[str, ...]) -> None:
     result = run(*words)
     assert (result.exit_code, daemon.changes) == (2, [])
@@ -203,7 +203,7 @@ def test_a_task_without_a_candidate_is_a_danger_that_is_accepted_by_name(daemon:
     assert planned["reason"].startswith("no-other-candidate: echo, merge: ")
     said = {"by": "ada@robot1", "reason": "", "for_s": None, "revision": 2, "kind": "drain"}
     daemon.set_flags([{"subject": name, **said} for name in ("edge1", "edge2")])
-    assert run("eligible", "robot1", "off", "--yes").exit_code == 0, "it was so before"
+    assert run("drain", "robot1", "--only", "new", "--yes").exit_code == 0, "it was so before"
 
 
 def test_it_is_watched_until_the_node_is_empty_and_every_move_is_told(daemon: Daemon) -> None:
@@ -314,14 +314,15 @@ def test_an_overtaken_revision_and_an_unknown_node_are_refused(daemon: Daemon) -
     assert "did you mean edge" in wrong.stderr
 
 
-def test_undrain_takes_only_the_drain_back_and_says_what_is_left(daemon: Daemon) -> None:
+def test_undrain_takes_every_drain_back(daemon: Daemon) -> None:
     said = {"by": "ada@robot1", "reason": "", "for_s": None, "revision": 2, "subject": "edge1"}
     daemon.set_flags([{"kind": "drain", **said}, {"kind": "ineligible", **said}])
     result = run("undrain", "edge1", "--yes")
     assert result.exit_code == 0
-    assert "edge1 still gets nothing new: `zsched eligible edge1 on`" in result.stdout
-    assert [flag["kind"] for flag in daemon.flags] == ["ineligible"]
-    assert run("eligible", "edge1", "on", "--yes").exit_code == 0
+    assert [line.split()[:2] for line in result.stdout.splitlines()[1:3]] == [
+        ["edge1", "drain"],
+        ["edge1", "ineligible"],
+    ]
     assert daemon.flags == []
     assert run("undrain", "edge1", "--yes").stdout.endswith("Nothing would change.\n")
     assert [one["event"] for one in events("undrain", "edge1", "--yes")] == ["unchanged"]
@@ -362,22 +363,25 @@ def test_the_verbs_list_and_every_page_shows_the_flags(daemon: Daemon) -> None:
         [{"kind": "drain", "subject": "edge1", **said}, {"kind": "ineligible", "subject": "edge2", **said}]
     )
     told = "drained, for 1m00s, ada@robot1: new fan"
-    assert run("drain").stdout == f"edge1: {told}, known for 3.0s\n"
-    assert run("eligible").stdout.startswith("edge2: gets nothing new, for 1m00s, ada@robot1")
-    (listed,) = events("drain")
+    first, second = run("drain").stdout.splitlines()
+    assert first == f"edge1: {told}, known for 3.0s"
+    assert second.startswith("edge2: gets nothing new, for 1m00s, ada@robot1")
+    listed, _ = events("drain")
     assert (listed["node"], listed["by"], listed["for_s"]) == ("edge1", "ada@robot1", 60.0)
-    assert f"edge1  drain       {told}" in run("maint").stdout
-    orders = json.loads(run("maint", "--json").stdout)["orders"]
-    assert [(order["kind"], order["subject"]) for order in orders] == [("drain", "edge1"), ("ineligible", "edge2")]
-    assert faults(json.loads(run("maint", "--json").stdout)) == []
     for page in (render_brief(daemon.status, 100, color=False), render_status(daemon.status, 100, color=False)):
         assert f"edge1: {told}, known for 3.0s" in page
         assert " drained " in page
         assert " no new " in page
 
 
-def test_a_word_that_is_neither_on_nor_off_and_a_self_elsewhere_are_refused(daemon: Daemon) -> None:
-    assert run("eligible", "edge1", "yes").exit_code == 2
+def test_nodes_that_get_nothing_new_keep_their_tasks_and_are_not_watched(daemon: Daemon) -> None:
+    result = run("drain", "edge1", "--only", "new", "--yes")
+    assert (result.exit_code, [line.split()[0] for line in result.stdout.splitlines()]) == (0, ["WHAT", "edge1", "It"])
+    assert [flag["kind"] for flag in daemon.flags] == ["ineligible"]
+
+
+def test_a_word_that_is_no_drain_and_a_self_elsewhere_are_refused(daemon: Daemon) -> None:
+    assert run("drain", "edge1", "--only", "old").exit_code == 2
     assert run("drain", "--self", "--node", "robot1").exit_code == 2
     assert run("drain", "--self", "--plan").stdout.splitlines()[1].split()[:2] == ["robot1", "drain"]
     assert daemon.changes == []
@@ -415,12 +419,3 @@ def test_a_drain_that_is_over_before_its_node_is_empty_is_not_said_to_stay_in_fo
     assert result.exit_code == 1
     assert "edge1: the drain is not in force any more: it was taken back, or its time is over" in result.stderr
     assert "stays in force" not in result.stdout
-
-
-def test_a_time_for_which_a_node_would_get_tasks_is_refused(daemon: Daemon) -> None:
-    """Nothing ends "on": whoever says so would find the node at work after that time."""
-    run("eligible", "edge1", "off", "--yes")
-    refused = run("eligible", "edge1", "on", "--for", "10m", "--yes")
-    assert (refused.exit_code, len(daemon.changes)) == (2, 1)
-    assert "--for goes with off" in refused.stderr
-    assert run("eligible", "edge1", "on", "--yes").exit_code == 0

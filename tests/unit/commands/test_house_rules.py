@@ -25,7 +25,7 @@ CLI_PAGE = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
 RULES = ("--plan", "--yes", "--revision", "--reason", "--json")
 """What every changing verb has, unless the page says why not."""
 CHANGING = {
-    *("move", "pin", "unpin", "pause", "resume", "tune", "restart", "drain", "undrain", "eligible"),
+    *("move", "pin", "unpin", "pause", "resume", "tune", "restart", "drain", "undrain"),
     *(
         "apply",
         "edit",
@@ -54,7 +54,6 @@ OTHERS = {
         "history",
         "events",
         "replay",
-        "maint",
         "logs",
     ),
     *("doctor", "ping", "bugreport", "wait", "check", "version", "completion", "man", "fleet show", "fleet export"),
@@ -62,7 +61,7 @@ OTHERS = {
     *("stream list", "stream hz", "stream bw", "stream tail", "metrics print", "metrics write", "demo", "bench paper"),
 }
 """What changes no fleet; `pki` makes files for an authority."""
-LISTING = ("pin", "unpin", "pause", "resume", "tune", "drain", "undrain", "eligible")
+LISTING = ("pin", "unpin", "pause", "resume", "tune", "drain", "undrain")
 
 
 def verbs() -> dict[str, set[str]]:
@@ -187,7 +186,6 @@ ORDERS: dict[str, tuple[str, ...]] = {
     "restart": ("map_merge", "edge2"),
     "drain": ("edge1",),
     "undrain": ("robot3",),
-    "eligible": ("edge1", "off"),
     "task remove": ("map_merge", "--accept", "remove-task"),
     "node remove": ("robot3", "--accept", "remove-node"),
     "rehearse": ("map_merge", "--steps", "move"),

@@ -337,7 +337,7 @@ def test_what_a_newer_daemon_promises_more_is_passed_over(daemon: Daemon, monkey
 
 def test_an_owner_with_an_order_is_not_drained(daemon: Daemon, stage: Stage) -> None:
     daemon.flags = [{"kind": "drain", "subject": "edge1", "by": "eve", "reason": "", "for_s": None, "revision": 2}]
-    assert stage.act(DRAIN)[1] == "edge1 has an order already; see `zsched maint`"
+    assert stage.act(DRAIN)[1] == "edge1 has an order already; see `zsched status`"
     assert stage.lift() == ""
     assert len(daemon.flags) == 1
     assert daemon.done == []
@@ -395,7 +395,7 @@ def test_a_second_ctrl_c_while_nobody_answers_tells_what_is_left(
     monkeypatch.setattr("zsched.commands.rehearse.time.sleep", pause)
     monkeypatch.setattr(rehearse, "monotonic_s", lambda: next(now))
     told = stage.lift()
-    assert told.startswith("a node may still be drained: no majority of the electors answers; `zsched maint` tells")
+    assert told.startswith("a node may still be drained: no majority of the electors answers; `zsched status` tells")
     assert "the drain is ended first" in capsys.readouterr().err
     monkeypatch.setattr(stage, "look", refuse)
     seconds = iter([0.0])
