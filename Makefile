@@ -70,7 +70,8 @@ format: $(VENV)/.dev  ## Format everything
 	$(BIN)/ruff check --fix .
 
 man: $(VENV)/.dev  ## Write the manual pages anew (man/), from the texts of --help
-	$(BIN)/zsched man man
+	rm -f man/*.1
+	$(BIN)/python package/manual.py man
 
 bench: $(VENV)/.dev  ## Print figures (takes some minutes; keep the machine quiet)
 	$(BIN)/python -m benchmarks.run

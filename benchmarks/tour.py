@@ -162,7 +162,6 @@ def the_tour(port: int) -> list[Step]:
         "record -o run.mcap --for 3s",
         "trace --help",
         "init --example python my-task",
-        "completion bash --help",
         "man manual",
         "recover --plan",
         "rejoin --help",

@@ -89,12 +89,10 @@ VERBS: tuple[Callable[..., None], ...] = (
     *(member.invite, member.join, member.leave, rehearse),
     *(doctor.doctor, doctor.ping, doctor.bugreport, question.wait, question.logs),
     *(document.check, document.apply, document.edit),
-    *(about.version, about.completion, about.complete, about.install, about.uninstall, about.man),
+    *(about.version, about.complete, about.install, about.uninstall),
 )
 """In the order of the help."""
 HIDDEN = ("complete",)
-NEED_ALL = ("complete", "man")
-"""Verbs that tell of the others."""
 
 for group in GROUPS:
     app.add_typer(group)
@@ -108,7 +106,7 @@ def _leave_out_others(word: str) -> None:
     groups = [
         one for one in app.registered_groups if one.typer_instance is not None and one.typer_instance.info.name == word
     ]
-    if (commands or groups or word == "--version") and word not in NEED_ALL:
+    if (commands or groups or word == "--version") and word not in HIDDEN:  # that one tells of the others
         app.registered_commands, app.registered_groups = commands, groups
 
 

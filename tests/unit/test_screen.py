@@ -100,7 +100,7 @@ def shown_on_a_terminal(arguments: list[str], folder: Path) -> str:
             "say which one this",
         ),
         (["zsched", "check", "wrong.yaml"], "did you mean 'wifi'?"),
-        (["zsched", "completion", "tcsh", "--"], "Error: Invalid value for 'SHELL': 'tcsh' is not one of"),
+        (["zsched", "drain", "--only", "old", "--"], "Error: Invalid value for '--only': 'old' is not"),
         (["zsched", "status", "--interval", "0"], "Input should be greater"),
         (["zsched", "dev", "empty"], "zsched init --example python empty"),
     ],

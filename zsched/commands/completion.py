@@ -86,8 +86,6 @@ def _values(param: Any) -> list[str]:
         from zsched.commands.apply import DANGERS  # noqa: PLC0415 - only who completes it pays for it
 
         return list(DANGERS)
-    if name == "SHELL":
-        return list(SCRIPTS)
     kind = getattr(getattr(param, "type_descriptor", None), "annotation", None)
     return [str(one.value) for one in kind] if isinstance(kind, type) and issubclass(kind, Enum) else []
 

@@ -25,6 +25,7 @@ INSTEAD: Final = {
     "list": "zsched status (nodes and tasks), or zsched stream list",
     "weights": "zsched tune TASK cpu=0.6 memory=0.4 network=0",
     "retry": "zsched restart TASK NODE",
+    **dict.fromkeys(("completion", "man"), "zsched install, which brings it"),
     "eligible": "zsched drain NODE --only new, or zsched undrain NODE",
     "maint": "zsched status, which tells every order",
     "remove": "zsched node remove NODE, or zsched task remove TASK",

@@ -1,11 +1,10 @@
-"""The verbs about the program itself: its versions, completion, installation and manual.
+"""The verbs about the program itself: its versions, completion and installation.
 
 Knows: options. Does not know: how anything is done (files of the verbs' names, imported by the verb that runs).
 """
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -21,29 +20,11 @@ def version(json_: JsonOption = False) -> None:
     show_versions(is_json=json_)
 
 
-class Shell(StrEnum):
-    """Where completion is wanted."""
-
-    BASH = "bash"
-    ZSH = "zsh"
-    FISH = "fish"
-
-
-def completion(shell: Annotated[Shell, typer.Argument(metavar="SHELL", help="bash, zsh or fish.")]) -> None:
-    """Print the script that completes verbs, options, nodes and tasks in a shell.
-
-    For bash: zsched completion bash > /etc/bash_completion.d/zsched
-    """
-    from zsched.commands.completion import script_file  # noqa: PLC0415 - each verb imports what it needs
-
-    typer.echo(script_file(shell.value).read_text(encoding="utf-8"), nl=False)
-
-
 def complete(
     ctx: typer.Context,
     words: Annotated[list[str] | None, typer.Argument(metavar="WORD...", help="Typed so far.")] = None,
 ) -> None:
-    """Print what the last word may become, for the scripts of `zsched completion`."""
+    """Print what the last word may become, for the scripts that `zsched install` brings."""
     from zsched.commands.completion import next_words  # noqa: PLC0415 - each verb imports what it needs
 
     for word in next_words(ctx.find_root().command, ctx, words or ()):
@@ -70,10 +51,3 @@ def uninstall(plan: PlanOption = False, root: RootOption = Path("/")) -> None:
     from zsched.commands.install import uninstall as do  # noqa: PLC0415 - each verb imports what it needs
 
     raise typer.Exit(do(root.absolute(), is_plan=plan))
-
-
-def man(ctx: typer.Context, folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where to.")]) -> None:
-    """Write the manual pages of all verbs, as files for man."""
-    from zsched.commands.manual import write_pages  # noqa: PLC0415 - each verb imports what it needs
-
-    write_pages(ctx.find_root().command, folder)

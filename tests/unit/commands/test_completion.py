@@ -1,4 +1,4 @@
-"""Completion: which words may come next, and that a shell gets them; the manual pages, which are the help."""
+"""Completion: which words may come next, and that a shell gets them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer.main
 from typer.testing import CliRunner
 
 from zsched import __version__
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands.manual import pages
+from zsched.commands.completion import script_file
 
 ROOT = Path(__file__).parents[3]
 RECORDED = Path(__file__).parent / "recorded_status"
@@ -55,7 +54,6 @@ def offered(*words: str) -> list[str]:
         (("restart", "merge", ""), ["ada", "bob", "eve"]),
         (("status", "--node", "b"), ["bob"]),
         (("status", "-n", ""), ["ada", "bob", "eve"]),
-        (("completion", ""), ["bash", "fish", "zsh"]),
         (("apply", "--accept", "remove-"), ["remove-node", "remove-task"]),
         (("up", "--log-level", "D"), ["DEBUG"]),
         (("check", ""), []),
@@ -68,7 +66,7 @@ def test_the_next_word(words: tuple[str, ...], expected: list[str]) -> None:
 
 
 def test_all_verbs_are_offered_but_hidden_ones() -> None:
-    assert {"status", "tune", "completion"} <= set(offered(""))
+    assert {"status", "tune", "install"} <= set(offered(""))
     assert "complete" not in offered("")
 
 
@@ -90,7 +88,7 @@ def test_without_a_daemon_and_a_file_nothing_is_offered(tmp_path: Path, monkeypa
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_the_script_is_one_that_the_shell_can_read(shell: str) -> None:
-    script = CliRunner().invoke(app, ["completion", shell]).stdout
+    script = script_file(shell).read_text()
     assert " complete -- " in script
     program = shutil.which(shell)
     if program is None:
@@ -103,58 +101,10 @@ def test_bash_completes_a_task_s_name(tmp_path: Path) -> None:
     program = tmp_path / "zsched"
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m zsched.cli "$@"\n')
     program.chmod(0o755)
-    script = CliRunner().invoke(app, ["completion", "bash"]).stdout
+    script = script_file("bash").read_text()
     script += f'COMP_WORDS=({program} tune m); COMP_CWORD=2; _zsched {program}; echo "${{COMPREPLY[@]}}"\n'
     done = subprocess.run(["bash"], input=script, capture_output=True, text=True, timeout=60, check=False)
     assert (done.stdout, done.stderr) == ("merge\n", "")
-
-
-def test_an_unknown_shell_is_a_usage_error() -> None:
-    assert CliRunner().invoke(app, ["completion", "tcsh"]).exit_code == 2
-
-
-# --- manual pages ----------------------------------------------------------------------------------------------------
-
-
-def test_the_manual_pages_that_are_shipped_are_today_s_help() -> None:
-    found = pages(typer.main.get_command(app))
-    shipped = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "man").glob("*.1")}
-    assert shipped == found, "write them anew: make man"
-
-
-def test_every_verb_has_a_page_with_all_its_options() -> None:
-    found = pages(typer.main.get_command(app))
-    assert {"zsched.1", "zsched-status.1", "zsched-stream.1", "zsched-stream-list.1"} <= set(found)
-    assert not [name for name in found if "complete." in name or "demo" in name]
-    page = found["zsched-tune.1"]
-    assert '.TH "ZSCHED-TUNE" "1" "" "zsched" "zsched"' in page
-    for text in ("\\-\\-revision N", "\\-\\-json", "TASK", "[KEY=VALUE]", ".SH DESCRIPTION\nShow a task's tuning"):
-        assert text in page
-    assert ".SH EXIT STATUS\n0 fine, 1 failed" in found["zsched.1"]
-
-
-def test_no_text_is_taken_for_a_request_of_roff() -> None:
-    known = (".TH ", ".SH ", ".TP", ".PP", ".B ")
-    for name, page in pages(typer.main.get_command(app)).items():
-        odd = [line for line in page.splitlines() if line[:1] in (".", "'") and not line.startswith(known)]
-        assert odd == [], name
-
-
-@pytest.mark.skipif(shutil.which("man") is None, reason="no man here")
-def test_man_reads_the_pages_without_a_warning(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["man", str(tmp_path / "man1")])
-    assert result.exit_code == 0
-    command = ["man", "--warnings", "-E", "UTF-8", "-l", str(tmp_path / "man1" / "zsched-status.1")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "Seconds between two" in done.stdout
-
-
-def test_man_into_no_folder_says_so(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    result = CliRunner().invoke(app, ["man", str(tmp_path / "file")])
-    assert result.exit_code == 1
-    assert "File exists; give a folder to write to" in result.stderr
 
 
 def test_version_as_an_option_is_one_line() -> None:

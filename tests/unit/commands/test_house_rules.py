@@ -56,7 +56,7 @@ OTHERS = {
         "replay",
         "logs",
     ),
-    *("doctor", "ping", "bugreport", "wait", "check", "version", "completion", "man", "fleet show", "fleet export"),
+    *("doctor", "ping", "bugreport", "wait", "check", "version", "fleet show", "fleet export"),
     *("install", "uninstall"),
     *("stream list", "stream hz", "stream bw", "stream tail", "metrics print", "metrics write", "demo", "bench paper"),
 }

@@ -1,35 +1,19 @@
 """Manual pages (man) out of the same texts as `--help`: one for the program, one for each verb.
 
-Knows: the tree of verbs as typer builds it, roff, files. Does not know: any verb.
+`make man` writes them: ``python package/manual.py FOLDER``.
 """
 
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from zsched.commands.common import CliError, counted, say
-from zsched.exits import EXIT_FAILED
+import typer.main
 
-
-def write_pages(program: Any, folder: Path) -> None:
-    """Write the pages of ``program`` into a folder, which is made if it is not there.
-
-    Raises:
-        CliError: the folder cannot be written.
-    """
-    found = pages(program)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, text in found.items():
-            (folder / name).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CliError(
-            EXIT_FAILED, f"{error.filename or folder}: {error.strerror}; give a folder to write to"
-        ) from error
-    say(f"{folder}: {counted(len(found), 'pages')}")
+from zsched.cli import app
 
 
 def pages(program: Any) -> dict[str, str]:
@@ -104,3 +88,8 @@ def _roff(text: str) -> str:
     """Plain text that roff takes for text."""
     escaped = text.replace("\\", "\\e").replace("-", "\\-").replace("`", "\\(ga")
     return f"\\&{escaped}" if escaped.startswith((".", "'")) else escaped
+
+
+if __name__ == "__main__":
+    for name, text in pages(typer.main.get_command(app)).items():
+        (Path(sys.argv[1]) / name).write_text(text, encoding="utf-8")
