@@ -45,6 +45,5 @@ def under(key: str, sample: Sample) -> Sample:
         sample.express,
         sample.source_info,
         sample.kind,
-        sample.congestion_control,
     )
     return cast("Sample", made)
