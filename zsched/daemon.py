@@ -46,7 +46,7 @@ from zsched.core.values.snapshot import Exposure
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
-from zsched.guard import calmed, on_failure
+from zsched.guard import calmed, end_with, on_failure
 from zsched.heap import Leftovers, give_back, share_heaps
 from zsched.ipc.takeover import Door
 from zsched.log_limit import log_to_stderr
@@ -72,6 +72,7 @@ from zsched.runtime.session_watch import SessionWatch
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Shell
 from zsched.runtime.strikes import Strikes
+from zsched.runtime.zenoh_file import operator_json5
 from zsched.screen import fitted
 from zsched.sessions import config as zenoh_config
 
@@ -230,7 +231,7 @@ class Daemon:
 
     def _read_settings(self) -> None:
         """What hangs on the fleet in force, and is the same for as long as the process lives."""
-        self._protocol = daemon_tls.protocol_of(self._fleet, daemon_tls.operator_json5(self._fleet))
+        self._protocol = daemon_tls.protocol_of(self._fleet, operator_json5(self._fleet))
         self._texts = {side: daemon_tls.session_text(self._fleet, side) for side in Side}
         if self._fleet.security is not None:
             require_own(self._fleet, self._fleet.security, self._spec.name)
@@ -612,7 +613,4 @@ def _set_up_logging(level: str) -> None:
 
 
 if __name__ == "__main__":
-    code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)  # zenoh's threads must not be waited for once everything is closed
+    end_with(main)

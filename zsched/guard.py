@@ -13,14 +13,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import sys
 import threading
 from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Coroutine, Generator
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NoReturn, TypeVar
 
 from zsched.clock import monotonic_s
+from zsched.exits import EXIT_FAILED, EXIT_OK
 
 PAUSE_S: Final = 0.1
 MAX_PAUSE_S: Final = 5.0
@@ -97,13 +100,32 @@ def ends_within(limit_s: float, run: Callable[..., object], *args: Any, name: st
     return not thread.is_alive()
 
 
+def end_with(main: Callable[[], object]) -> NoReturn:
+    """Run a program, and end the process with its code, or with that of a failure, whatever it raises.
+
+    Zenoh's threads are not waited for: the interpreter would wait for ever, and the process live on without its socket.
+    What zenoh raises when it panics is no `Exception`.
+    """
+    code: object = EXIT_FAILED
+    try:
+        code = main()
+    except SystemExit as error:
+        code = error.code or EXIT_OK
+    except BaseException as error:  # noqa: BLE001 - it ends with the process
+        _log.critical("the process ends: %s: %s", type(error).__name__, error, exc_info=True)
+    with contextlib.suppress(OSError, ValueError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else EXIT_FAILED)
+
+
 def tolerant(callback: Callable[[T], object], kind: str) -> Callable[[T], None]:
     """``callback`` for one of zenoh's threads: what it raises is noted (zenoh would print every one, without limit)."""
 
     def call(value: T) -> None:
         try:
             callback(value)
-        except Exception as error:  # noqa: BLE001 - one frame must not end what follows it, nor fill the log
+        except BaseException as error:  # noqa: BLE001 - one frame must not end what follows it, nor fill the log
             note(kind, error)
 
     return call

@@ -41,6 +41,7 @@ from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.runtime.restarts import opens_anew, restarts
+from zsched.runtime.zenoh_file import judged
 
 SCHEMA = "zsched.apply/1"
 OTHER_FILES = "other-files"
@@ -188,7 +189,7 @@ def make_plan(
     """
     config = places.config_path(None, os.environ)
     folder = config.absolute().parent if config.exists() else None  # where the nodes read it
-    result = check_bytes(text.encode(), file, folder, part)
+    result = judged(check_bytes(text.encode(), file, folder, part))
     if held.document:
         result = replace(result, warnings=warnings_in_force(text, result.warnings))
     if result.fleet is None:

@@ -14,11 +14,12 @@ from zsched.commands.rules import told_once
 from zsched.config.load import check_file
 from zsched.core.values.fleet import fleet_hash
 from zsched.exits import EXIT_CONFIG, EXIT_OK
+from zsched.runtime.zenoh_file import judged
 
 
 def show_faults(given: Path | None, *, is_json: bool, is_verbose: bool) -> int:
     """Show the faults of a fleet file (``None``: this machine's own), or its counts, and its rules; the exit code."""
-    result = check_file(places.config_path(given, os.environ))
+    result = judged(check_file(places.config_path(given, os.environ)))
     fleet = result.fleet
     counts: Json | None = None
     digest = None if fleet is None else fleet_hash(fleet)

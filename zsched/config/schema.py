@@ -431,7 +431,11 @@ FLEET: Final = Record(
         "zenoh": Field(
             Record(
                 "a zenoh section",
-                {"config": Field(_FILE, "JSON5 file passed to zenoh untouched, relative to the fleet file.")},
+                {
+                    "config": Field(
+                        _FILE, "JSON5 file of settings of zenoh, relative to the fleet file; `check` judges it."
+                    )
+                },
             ),
             "Settings of zenoh itself.",
         ),

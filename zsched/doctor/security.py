@@ -26,9 +26,10 @@ from zsched.files import read_regular
 from zsched.runtime.own_addresses import Address, addresses_at
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import CERTIFICATE, files_by, require_own
-from zsched.runtime.tls import ENCRYPTED, PLAIN, operator_json5, plain_text_problem, protocol_of
+from zsched.runtime.tls import ENCRYPTED, PLAIN, plain_text_problem, protocol_of
+from zsched.runtime.zenoh_file import operator_json5
 from zsched.sessions.certificate import common_names, validities
-from zsched.sessions.config import tls_files
+from zsched.sessions.config import tls_settings
 
 SOON: Final = timedelta(days=30)
 """Of certificates that somebody else issues."""
@@ -108,7 +109,8 @@ def _named_files(scene: Scene) -> dict[str, str]:
     """{what it is: path} of every certificate and key of this machine."""
     security = scene.fleet.security
     if security is None:
-        return tls_files(operator_json5(scene.fleet))
+        named = tls_settings(operator_json5(scene.fleet))
+        return {name: path for name, path in named.items() if path and name.endswith(("certificate", "private_key"))}
     files = files_by(security, scene.state_folder)
     return {"certificate": str(files.certificate), "key": str(files.key), "authority": str(files.trusted)}
 

@@ -47,7 +47,7 @@ from zsched.drivers.engine import Ended, Look, begin
 from zsched.drivers.place import Place
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
-from zsched.guard import ends_within, guarded
+from zsched.guard import end_with, ends_within, guarded
 from zsched.sessions.closing import CLOSE_S
 from zsched.wire.keyspace import Keyspace
 from zsched.worker.roles import RoleWatch
@@ -306,6 +306,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    status = main()
-    sys.stderr.flush()
-    os._exit(status)  # a session that is still being closed would hold the interpreter
+    end_with(main)

@@ -15,12 +15,12 @@ from __future__ import annotations
 import argparse
 import ctypes
 import faulthandler
-import logging
 import os
 import signal
 import sys
 from pathlib import Path
 
+from zsched.guard import end_with
 from zsched.heap import share_heaps
 from zsched.ipc.protocol import RelayHello
 from zsched.log_limit import log_to_stderr
@@ -32,8 +32,8 @@ STOP_S = 2.0
 """A daemon that stops hands its tasks over first, and its robot's streams must run until then."""
 
 
-def main() -> None:
-    """Run the relay; never returns (threads of zenoh must not be waited for at exit)."""
+def main() -> int:
+    """Run the relay; the exit code."""
     arguments = _arguments()
     log_to_stderr(arguments.log_level, "%(name)s %(levelname)s %(message)s")
     share_heaps()
@@ -45,37 +45,28 @@ def main() -> None:
     faulthandler.enable()
     faulthandler.register(signal.SIGUSR1)  # where every thread stands, for the reader of the journal
     os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)  # read once, when zenoh's runtime starts
-    code = 1
-    try:
-        from zsched.relay.process import run  # noqa: PLC0415 - imports zenoh, which must find ZENOH_RUNTIME set
+    from zsched.relay.process import run  # noqa: PLC0415 - imports zenoh, which must find ZENOH_RUNTIME set
 
-        pipes = (sys.stdin.fileno(), sys.stdout.fileno())
-        me = RelayHello(
-            fleet=arguments.fleet,
-            node=arguments.node,
-            incarnation=arguments.incarnation,
-            digest=arguments.digest,
-            session=arguments.session,
-            threads=arguments.threads,
-        )
-        code = run(
-            me,
-            *pipes,
-            has_local_side=arguments.local,
-            door=arguments.door,
-            orphan_s=arguments.orphan,
-            parent=arguments.parent,
-            streams=Path(arguments.streams) if arguments.streams else None,
-            streams_listen=arguments.streams_listen,
-            books=Path(arguments.books) if arguments.books else None,
-        )
-    except SystemExit:
-        code = 0
-    except BaseException:
-        logging.getLogger("zsched.relay").exception("the relay ends")
-    finally:
-        sys.stderr.flush()
-        os._exit(code)
+    pipes = (sys.stdin.fileno(), sys.stdout.fileno())
+    me = RelayHello(
+        fleet=arguments.fleet,
+        node=arguments.node,
+        incarnation=arguments.incarnation,
+        digest=arguments.digest,
+        session=arguments.session,
+        threads=arguments.threads,
+    )
+    return run(
+        me,
+        *pipes,
+        has_local_side=arguments.local,
+        door=arguments.door,
+        orphan_s=arguments.orphan,
+        parent=arguments.parent,
+        streams=Path(arguments.streams) if arguments.streams else None,
+        streams_listen=arguments.streams_listen,
+        books=Path(arguments.books) if arguments.books else None,
+    )
 
 
 def _arguments() -> argparse.Namespace:
@@ -118,4 +109,4 @@ def _stop(_signal: int, _frame: object) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    end_with(main)

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from typing import Any, Final
 
+from zsched.core.route.keyexpr import includes
 from zsched.core.route.ros2 import BUFFERS, is_rmw_key
 from zsched.core.route.route import widened
 from zsched.core.values.certificates import Role, accepted
@@ -32,6 +33,7 @@ LISTEN: Final = ("declare_subscriber", "declare_liveliness_subscriber", "livelin
 GET: Final = ("put", "delete", "reply", "liveliness_token")
 """What a reader is sent."""
 ALL: Final = (*SPEAK, *ASK, *LISTEN)
+FLOWS: Final = ("ingress", "egress")
 ANYTHING: Final = "**"
 ADVANCED: Final = "@adv"
 """The chunk of the caches and tokens of zenoh's advanced publishers."""
@@ -77,6 +79,51 @@ def access_control(fleet: Fleet, security: Security, side: Side) -> Json:
     }
 
 
+def first_denied(fleet: Fleet, rules: Json) -> tuple[str, str, str] | None:
+    """What the fleet needs and an operator's own ``access_control`` lets nobody do: (message, flow, key).
+
+    Whom a rule is for only the link tells. So a rule that allows counts for everybody, and one that denies does not
+    count where its subject is narrower than everybody.
+    """
+    held = {rule["id"]: rule for rule in rules.get("rules") or ()}
+    everybody = {one["id"] for one in rules.get("subjects") or () if not any(one[name] for name in one if name != "id")}
+    allows, denies = [], []
+    for policy in rules.get("policies") or ():
+        for rule in (held[name] for name in policy["rules"] if name in held):
+            if rule["permission"] == "allow":
+                allows.append(rule)
+            elif everybody & set(policy["subjects"]):
+                denies.append(rule)
+
+    def has(some: list[Json], message: str, flow: str, key: str) -> bool:
+        return any(
+            message in rule["messages"] and flow in (rule["flows"] or FLOWS) and includes(expr, key)
+            for rule in some
+            for expr in rule["key_exprs"]
+        )
+
+    is_open = rules["default_permission"] == "allow"
+    for message, key in _needs(fleet):
+        for flow in FLOWS:
+            if has(denies, message, flow, key) or not (is_open or has(allows, message, flow, key)):
+                return message, flow, key
+    return None
+
+
+def _needs(fleet: Fleet) -> Iterator[tuple[str, str]]:
+    """(message, key) without which no fleet works, then those of its streams."""
+    for node in fleet.nodes:
+        yield from ((message, _own(fleet, node)) for message in ALL if message != "delete")
+    for node in fleet.nodes:
+        for key in _stream_keys(fleet, node)[0]:
+            yield from ((message, key) for message in ("put", "declare_subscriber"))
+
+
+def _own(fleet: Fleet, node: NodeSpec) -> str:
+    """The keys under which only that node speaks."""
+    return f"{Keyspace(fleet.name).all_puts().removesuffix('*/*')}*/{node.name}/**"
+
+
 def common_names_of(fleet: Fleet, security: Security) -> frozenset[str]:
     """The common name of every certificate that is let in."""
     holders = _holders(fleet, security, Side.CONTROL)
@@ -113,7 +160,7 @@ def _node_rules(fleet: Fleet, node: NodeSpec, side: Side) -> Iterator[Rule]:
         yield "ingress", ALL, everything
         yield "egress", ALL, everything
         return
-    own = f"{keys.all_puts().removesuffix('*/*')}*/{node.name}/**"
+    own = _own(fleet, node)
     if side is Side.CONTROL:
         # The last: a node passes on the questions of those that hang on it (`zsched status --connect`).
         asked = [keys.all_questions("*").removesuffix("*") + node.name, keys.status("*", "*")]

@@ -21,7 +21,8 @@ from zsched.core.vote.belief import MAX_GENERATION
 from zsched.core.vote.generations import blank_state, objection
 from zsched.errors import AdapterError
 from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import asker_in, operator_json5, protocol_of, session_text
+from zsched.runtime.tls import asker_in, protocol_of, session_text
+from zsched.runtime.zenoh_file import operator_json5
 from zsched.sessions import config as zenoh_config
 
 

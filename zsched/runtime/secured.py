@@ -126,16 +126,8 @@ def secured_text(
     ``env``: as in `files_of`.
 
     Raises:
-        ConfigError: a file is missing or cannot be read, or the operator's file has TLS or access control of its own.
+        ConfigError: a file is missing or cannot be read.
     """
-    try:
-        if zenoh_config.tls_settings(operator_json5) or zenoh_config.has_access_control(operator_json5):
-            raise ConfigError(
-                f"{fleet.zenoh_config}: it sets TLS or access control, and the fleet file has a `security:` section, "
-                "which makes both; keep one of them"
-            )
-    except ValueError as error:
-        raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
     files = files_of(security, env)
     for path in (files.certificate, files.key, files.trusted):
         bytes_of(path)

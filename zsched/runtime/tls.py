@@ -9,39 +9,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Final
 
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
-from zsched.files import read_regular
 from zsched.runtime.access_rules import Side
 from zsched.runtime.secured import identity_of, secured_text
+from zsched.runtime.zenoh_file import operator_json5
 from zsched.sessions import config as zenoh_config
 
-MAX_BYTES: Final = 1 << 20
 PLAIN: Final = "tcp"
 ENCRYPTED: Final = ("tls", "quic")
 TO_LISTEN: Final = ("listen_certificate", "listen_private_key")
-
-
-def operator_json5(fleet: Fleet) -> str:
-    """The text of the operator's zenoh file; empty when the fleet file names none.
-
-    Raises:
-        ConfigError: it cannot be read.
-    """
-    if not fleet.zenoh_config:
-        return ""
-    try:
-        return read_regular(Path(fleet.zenoh_config), MAX_BYTES).decode("utf-8")
-    except (OSError, ValueError) as error:
-        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise ConfigError(
-            f"{fleet.zenoh_config}: cannot be read: {reason}; the fleet file names it under `zenoh: {{config: ...}}`"
-        ) from error
 
 
 def session_text(fleet: Fleet, side: Side, env: Mapping[str, str] = os.environ) -> str:
@@ -69,12 +50,9 @@ def protocol_of(fleet: Fleet, text: str) -> str:
     """What sessions listen with where the fleet file does not say: ``tls`` or ``tcp``; ``text``: the operator's file.
 
     Raises:
-        ConfigError: it is no zenoh configuration, or there is TLS, but nothing to listen with.
+        ConfigError: there is TLS, but nothing to listen with.
     """
-    try:
-        settings = zenoh_config.tls_settings(text)
-    except ValueError as error:
-        raise ConfigError(f"{fleet.zenoh_config}: {error}") from error
+    settings = zenoh_config.tls_settings(text)
     if fleet.security is not None:
         return "tls"
     endpoints = [end for node in fleet.nodes for end in (node.listen_control, node.listen_data) if end]

@@ -101,15 +101,8 @@ def control_config(
     if at_most_hz:
         rules = [{"key_expr": key, "freq": hz} for key, hz in at_most_hz.items()]
         own = {"id": "zsched", "messages": ["put"], "flows": ["ingress"], "rules": rules}
-        settings["downsampling"] = [own, *_downsampling_of(operator_json5)]
+        settings["downsampling"] = [own, *(setting(operator_json5, "downsampling") or [])]
     return _render(settings, operator_json5)
-
-
-def _downsampling_of(operator_json5: str) -> list[Settings]:
-    if not operator_json5.strip():
-        return []
-    found: list[Settings] = json.loads(_parsed(operator_json5).get_json("downsampling"))
-    return found
 
 
 def data_config(
@@ -252,27 +245,23 @@ def lease_s(session: str) -> float:
     return float(json.loads(zenoh.Config.from_json5(session).get_json("transport/link/tx/lease"))) / 1000
 
 
-def tls_settings(operator_json5: str) -> frozenset[str]:
-    """Which settings of ``transport/link/tls`` the operator's own text makes.
+def setting(operator_json5: str, path: str) -> Any:
+    """What the operator's own text says at one place, else zenoh's default; ``None`` where there is no text.
 
     Raises:
         ValueError: it is not a zenoh configuration.
     """
-    if not operator_json5.strip():
-        return frozenset()
-    found = json.loads(_parsed(operator_json5).get_json("transport/link/tls"))
-    return frozenset(name for name, value in (found or {}).items() if value is not None)
+    return json.loads(_parsed(operator_json5).get_json(path)) if operator_json5.strip() else None
 
 
-def has_access_control(operator_json5: str) -> bool:
-    """Whether the operator's own text turns zenoh's access control on.
+def tls_settings(operator_json5: str) -> Settings:
+    """The settings of ``transport/link/tls`` that the operator's own text makes.
 
     Raises:
         ValueError: it is not a zenoh configuration.
     """
-    if not operator_json5.strip():
-        return False
-    return bool((json.loads(_parsed(operator_json5).get_json("access_control")) or {}).get("enabled"))
+    found = setting(operator_json5, "transport/link/tls") or {}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def secured(*, certificate: str, key: str, trusted: str, rules: Settings, operator_json5: str = "") -> str:
@@ -300,18 +289,6 @@ def secured(*, certificate: str, key: str, trusted: str, rules: Settings, operat
         "access_control": rules,
     }
     return _render(settings, operator_json5)
-
-
-def tls_files(operator_json5: str) -> dict[str, str]:
-    """{setting: path} of every certificate and key that the operator's own text names under ``transport/link/tls``.
-
-    Raises:
-        ValueError: it is not a zenoh configuration.
-    """
-    if not operator_json5.strip():
-        return {}
-    found = json.loads(_parsed(operator_json5).get_json("transport/link/tls")) or {}
-    return {name: str(path) for name, path in found.items() if path and name.endswith(("certificate", "private_key"))}
 
 
 # --- threads ---------------------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from zsched import daemon
 from zsched.core.scheduler import rounds
+from zsched.guard import end_with
 from zsched_lab.paper.rules import JudgeMaker, RuleName
 
 
@@ -39,7 +40,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    code = main()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)  # as the daemon itself: zenoh's threads must not be waited for
+    end_with(main)

@@ -43,13 +43,6 @@ def test_the_text_has_tls_both_ways_and_denies_what_no_rule_allows(pki: Path) ->
     assert session_text(replace(yard, security=None), Side.CONTROL) == ""
 
 
-def test_a_file_with_tls_or_rules_of_its_own_does_not_go_with_the_section(pki: Path) -> None:
-    yard, security = fleet(pki)
-    for text in ('{transport: {link: {tls: {root_ca_certificate: "a"}}}}', "{access_control: {enabled: true}}"):
-        with pytest.raises(ConfigError, match="keep one of them"):
-            secured_text(yard, security, Side.DATA, text)
-
-
 @pytest.mark.parametrize("name", ["certificate.pem", "key.pem", "ca.pem"])
 def test_a_missing_file_is_named_and_never_means_plain_text(pki: Path, name: str) -> None:
     (pki / name).unlink()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,7 @@ from support.fleets import fleet_of, node_of
 from zsched.core.values.fleet import Fleet, LocalMode, LocalSide, Security
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
-from zsched.runtime.tls import exposure, operator_json5, plain_text_problem, protocol_of
+from zsched.runtime.tls import exposure, plain_text_problem, protocol_of
 
 FILE = "/etc/zsched/zenoh.json5"
 WHOLE = """{transport: {link: {tls: {root_ca_certificate: "a", listen_certificate: "b", listen_private_key: "c"}}}}"""
@@ -49,17 +48,6 @@ def test_settings_of_tls_or_an_encrypted_endpoint_make_it(text: str, control: st
 def test_tls_that_could_not_listen_is_refused_with_what_is_missing(text: str, control: str, missing: str) -> None:
     with pytest.raises(ConfigError, match=f"TLS without {missing}, with which"):
         protocol_of(fleet(control), text)
-
-
-def test_a_file_that_zenoh_cannot_read_is_named() -> None:
-    with pytest.raises(ConfigError, match=f"{FILE}: zenoh: config is not a zenoh configuration"):
-        protocol_of(fleet(), "{transport: 3")
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"gone\.json5: cannot be read: No such file"):
-        operator_json5(replace(fleet(), zenoh_config=str(tmp_path / "gone.json5")))
-    assert operator_json5(replace(fleet(), zenoh_config="")) == ""
 
 
 @pytest.mark.parametrize(
