@@ -264,7 +264,7 @@ SCHEDULING: Final = Record(
         "deadline_ms": Field(
             Number(MIN_DEADLINE_MS, MAX_DEADLINE_MS, "ms"),
             "For `objective: latency`: a job that takes longer, from input to output and the network included, "
-            "comes too late. Of a worker without the library, answers with their input's timestamp tell how long.",
+            "comes too late. It counts for workers with the library, which tell how long their jobs take.",
             default="none",
         ),
         "aggregate": Field(

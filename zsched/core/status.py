@@ -25,7 +25,7 @@ from zsched.core.values.decision import Explanation
 from zsched.core.values.document import Flag
 from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
-from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId
+from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, Reach, TaskId
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
@@ -529,12 +529,23 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         yield (
             f"{owner} has had inputs of this robot and answered none of them for {waited_s:.0f} s: its worker hangs, "
             f"or what is large does not reach it (`zsched ping {owner}` tries that); `zsched logs {task.name}`, "
-            f"`zsched restart {task.name}`"
+            f"`zsched restart {task.name}`{_outvoted(node, task)}"
         )
     since = _unready_since(node, executor)
     if is_server_ready and now - since >= UNREADY_SHOWN_S:
         waited = f"this robot's streams have waited for {executor.served_by} for {now - since:.0f} s"
-        yield f"{waited}: {_untaken(task, executor, node.unready.get(task.name))}"
+        told = _outvoted(node, task) if owner in node.unseen.found.get(task.name, ()) else ""
+        yield f"{waited}: {_untaken(task, executor, node.unready.get(task.name))}{told}"
+
+
+def _outvoted(node: Stages, task: TaskSpec) -> str:
+    """What helps a robot whose streams do not reach the owner, where a majority of the others' may keep it there."""
+    is_alone = node.rounds.tasks[task.name].spec.reach is Reach.ALL or len(node.fleet.voters) < 2
+    return (
+        ""
+        if is_alone
+        else f"; if the others' streams reach it, `zsched tune {task.name} reach=all` lets this one count"
+    )
 
 
 def _hangs(load: WorkerLoad) -> bool:

@@ -41,6 +41,7 @@ from zsched.relay.books import Books
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
+from zsched.relay.mute_links import MuteLinks
 from zsched.relay.open_streams import OpenStreams
 from zsched.relay.roles import RoleServer
 from zsched.relay.streams.acks import DEFAULT_LEASE_S, Acks
@@ -194,6 +195,7 @@ class RelayProcess:
         self._acks = Acks(session, keyspace, node, self._has_worker, link_lease_s)
         self._roles = RoleServer(session, keyspace, node)
         self._matching = Matching(session, reporter.report)
+        self._mute_links = MuteLinks(session, keyspace)
         self._troubles = Troubles(session, keyspace, node, reporter.report)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         self._token = self._shown(session)
@@ -248,6 +250,7 @@ class RelayProcess:
             for task in tasks:
                 task.rejoin(session, self._own_ids)
             self._token = self._shown(session)
+            self._mute_links = MuteLinks(session, Keyspace(self._fleet))
             self._application.open(config)
         _log.warning(
             "the data session is opened anew: streams waited %.2f s for what was under way, it took %.2f s",
@@ -433,9 +436,10 @@ class RelayProcess:
             self._tell_refused()
             for kind in calmed(monotonic_s()):
                 self._reporter.report(ProblemReported(source=_of_thread(kind), problem=None))
-            is_missing = any(task.misses_its_worker for task in tuple(self._tasks.values()))
-            if introductions.is_due(awake_s(), is_missing=is_missing) and self._introducer is not None:
+            missed = {node for task in tuple(self._tasks.values()) if (node := task.missed) is not None}
+            if introductions.is_due(awake_s(), is_missing=bool(missed)) and self._introducer is not None:
                 self._introducer.introduce()
+            self._mute_links.look(missed - {self._node}, awake_s())
 
     def _own_counts(self) -> tuple[StreamCount, ...]:
         return tuple(count for task in tuple(self._tasks.values()) for count in task.counts())

@@ -19,7 +19,7 @@ from zenoh import Session, Timestamp
 from zsched.clock import monotonic_s
 from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import RelayReport, SlotLost
-from zsched.core.values.model import MAX_REASON, TaskId
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import (
     Direction,
     DrainingSlot,
@@ -204,10 +204,10 @@ class TaskRelay:
         self._queue.put(Ended())
 
     @property
-    def misses_its_worker(self) -> bool:
-        """Whether streams are meant to go to a worker that is not ready, or cannot be reached."""
+    def missed(self) -> NodeId | None:
+        """Whose worker streams are meant to go to that is not ready, or cannot be reached; ``None``: nobody's."""
         current = self._current()
-        return current is not None and not current.is_ready
+        return None if current is None or current.is_ready else current.slot.owner
 
     def counts(self) -> tuple[StreamCount, ...]:
         """The counters of every stream, by name."""

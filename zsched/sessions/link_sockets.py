@@ -39,6 +39,8 @@ _INTERNET: Final = (socket.AF_INET, socket.AF_INET6)
 _BYTES_ACKED: Final = struct.Struct("<Q")
 _BYTES_ACKED_AT: Final = 120
 """Where ``tcpi_bytes_acked`` stands in Linux's ``struct tcp_info`` (4.1 and later)."""
+_BYTES_RECEIVED_AT: Final = 128
+"""Where ``tcpi_bytes_received`` stands there."""
 _LAST_DATA_RECV: Final = struct.Struct("<I")
 _LAST_DATA_RECV_AT: Final = 52
 """Where ``tcpi_last_data_recv`` stands there, in ms."""
@@ -84,6 +86,10 @@ class LinkSocket(Struct, frozen=True):
     def taken(self) -> int:
         """How many bytes the other end has taken so far; 0 when the socket is gone."""
         return self._tcp_info(_BYTES_ACKED, _BYTES_ACKED_AT)
+
+    def brought(self) -> int:
+        """How many bytes have come from the other end so far; 0 when the socket is gone."""
+        return self._tcp_info(_BYTES_ACKED, _BYTES_RECEIVED_AT)
 
     def silent_s(self) -> float:
         """How long nothing has come from the other end; zenoh sends three or four signs of life in a lease."""

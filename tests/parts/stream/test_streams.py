@@ -580,7 +580,7 @@ def test_closing_sends_the_newest_value_that_a_rate_holds_back(bench: Bench) -> 
     bench.application.plan(replace(PLAN, current=replace(SLOT, routes=(route, OUT))))
     with bench.join() as own:
         publisher = own.publisher("robot1/front/in")
-        until(lambda: not own._tasks["t"].misses_its_worker, "its worker has been warmed up")
+        until(lambda: own._tasks["t"].missed is None, "its worker has been warmed up")
         assert publisher.put("0")
         until(lambda: bench.taken == [b"0"], "the first")
         for number in range(1, 4):

@@ -1312,6 +1312,7 @@ def test_an_owner_that_has_ceased_to_answer_is_one_that_this_robot_does_not_reac
         node.handle(ev.StreamsCounted(counts=(count,)), at)
         problems = build_snapshot(node, at).tasks[0].problems
         is_shown = any("edge1 has had inputs of this robot and answered none" in one for one in problems)
+        assert is_shown is any("`zsched tune merge reach=all`" in one for one in problems)
         told.append((is_shown, "edge1" in node._doubts(FLEET.tasks[0], at).unseen))
     assert told == [(second >= 10, second >= 10) for second in range(12)]
     node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 112.0)

@@ -203,7 +203,7 @@ class WorkerSpec:
     )
     stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL; at the daemon's own end 0.35 s.", SECONDS)
     output_deadline_s: float | None = key(
-        None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="not watched"
+        None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="by the task's rhythm"
     )
     max_failures: int = key(3, "This many failures in the window make the node ineligible.", Range(1, 100))
     failure_window_s: float = key(
