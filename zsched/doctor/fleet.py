@@ -54,11 +54,14 @@ def answer(scene: Scene) -> Result:
 
 
 def addresses_answer(scene: Scene) -> Result:
-    """Whether the addresses of all nodes that live take connections from here, and data sessions large samples."""
-    named = addresses(scene.fleet.nodes)
+    """Whether the addresses of all others that live take connections from here, and data sessions large samples.
+
+    Not our own: behind an address translation that serves the others it may lead nowhere from inside.
+    """
+    named = addresses(spec for spec in scene.fleet.nodes if spec.name != scene.node)
     living = [address for address in named if address.node in scene.statuses or _is_heard(scene, address.node)]
     if not living:
-        return skipped("no living node has an address in the fleet file")
+        return skipped("no other living node has an address in the fleet file")
     shut = list(connected(living))
     found = shut or _small_only(scene, [address for address in living if address.session == "data"])
     return joined(found, passed(f"{counted(len(living), 'addresses')} of living nodes, all take connections"))

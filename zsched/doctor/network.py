@@ -207,14 +207,6 @@ def _holders(inodes: set[str]) -> list[tuple[int, list[str]]]:
 # --- connections -----------------------------------------------------------------------------------------------------
 
 
-def own_addresses_answer(scene: Scene) -> Result:
-    """Whether this node's sessions take connections at the addresses that others dial."""
-    mine = addresses([scene.me])
-    if not mine:
-        return skipped(f"{scene.node} has no address: it dials the others")
-    return joined(connected(mine), passed(f"{counted(len(mine), 'addresses')}, all take connections"))
-
-
 def connected(found: list[Address]) -> Iterator[Result]:
     """A result for each address that takes no connection."""
     streams = [address for address in found if address.is_stream]

@@ -85,12 +85,6 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=network.is_not_alone_on_loopback,
     ),
     Check(name="net.ports", asks="Does nobody else listen on its ports?", run=network.ports_are_ours),
-    Check(
-        name="net.own_addresses",
-        asks="Do its addresses take connections?",
-        run=network.own_addresses_answer,
-        needs=Needs.STATUS,
-    ),
     Check(name="tls.plain_text", asks="With TLS, is nothing in plain text?", run=security.nothing_in_plain_text),
     Check(
         name="tls.certificates",
@@ -130,7 +124,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     Check(name="fleet.answers", asks="Does every node answer?", run=fleet.answer, needs=Needs.FLEET),
     Check(
         name="fleet.addresses",
-        asks="Do all addresses take connections?",
+        asks="Do all others' addresses take connections?",
         run=fleet.addresses_answer,
         needs=Needs.FLEET,
     ),

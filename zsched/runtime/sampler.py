@@ -144,6 +144,7 @@ class Sampler:
             self._inbox.post(sampled)  # it shows a change: the loop may sleep for a while
         else:
             self._inbox.post_quietly(sampled)
+        self._report("profile/cpu", self._device.problem)
         for index in range(max(len(readers), self._links_read)):
             # One that the fleet file does not name any more has no problem.
             self._report(f"profile/link{index}", readers[index].problem if index < len(readers) else None)

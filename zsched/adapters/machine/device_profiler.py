@@ -3,8 +3,8 @@
 CPU in use is a difference, so the first sample has none, and the first one on other CPUs. Without a quota it is taken
 from the CPUs this process may run on: everything but idle and iowait (a CPU that waits for a disk can run a task; one
 that the hypervisor stole cannot). Under a quota the machine *is* the group that holds the smallest quota: its cores,
-its own accounting. Memory in use is total - MemAvailable, or under a limit the group's working set, or what the machine
-has left if that is less.
+its own accounting; where it has none, the machine's share in use counts for those cores. Memory in use is
+total - MemAvailable, or under a limit the group's working set, or what the machine has left if that is less.
 
 A worker's load is its whole process tree. CPU: the difference of user and system time, children that were waited for
 included, so short-lived ones count. How long its threads have run and waited to run (schedstat) tells what it wants
@@ -113,6 +113,8 @@ class DeviceProfiler:
         """Read everything below ``root`` ("/" but in tests), as process ``pid`` sees it."""
         self.speed: float | None = None
         """How fast a core is, when somebody has measured it."""
+        self.problem: str | None = None
+        """What the kernel does not tell."""
         self._root, self._pid = root, pid
         self._proc = str(root / "proc")
         self._trees = _ProcessTrees(self._proc)
@@ -201,13 +203,15 @@ class DeviceProfiler:
         return float(times.cpus if times is not None else os.cpu_count() or 1)
 
     def _cpu_used(self, times: CpuTimes | None, now: float) -> float | None:
-        if self._cpu_quota is not None:
-            used_s, clock_s, scale, cpus = self._cpu_quota.used_s(), now, 1.0, None
+        quota = self._cpu_quota
+        used_s = None if quota is None else quota.used_s()
+        is_silent = quota is not None and used_s is None
+        self.problem = "the control group does not tell its CPU time: the machine's share counts" if is_silent else None
+        if used_s is not None:
+            clock_s, scale, cpus = now, 1.0, None
         elif times is not None:  # the kernel's own ticks are the clock: no jitter between two reads
-            used_s, clock_s, scale, cpus = times.busy_s, times.total_s, float(times.cpus), times.cpus
+            used_s, clock_s, scale, cpus = times.busy_s, times.total_s, self._capacity(times), times.cpus
         else:
-            used_s = None
-        if used_s is None:
             self._usage = self._used_cores = None
             return None
         new = (used_s, clock_s, cpus)

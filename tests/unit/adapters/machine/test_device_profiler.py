@@ -126,6 +126,24 @@ def test_quota_makes_the_group_the_machine(tmp_path: Path, clock: Clock) -> None
     assert profiler.sample({}).cpu_used_cores == pytest.approx(0.3)
 
 
+def test_a_group_that_does_not_tell_its_cpu_time_is_as_busy_as_the_machine(tmp_path: Path, clock: Clock) -> None:
+    """Else it would not be measured, and could have no task."""
+    quota = {"proc/self/mountinfo": V2, "proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/cpu.max": "150000 100000\n"}
+    profiler = machine(tmp_path, **quota)
+    profiler.sample({})
+    write(tmp_path, {"proc/stat": stat("140 0 0 160 0 0 0 0 0 0", "110 0 0 190 0 0 0 0 0 0")})
+    sample = profiler.sample({})
+    assert [sample.cpu_cores, sample.cpu_used_cores] == pytest.approx([1.5, 1.5 * 50 / 200])
+    assert "does not tell" in (profiler.problem or "")
+    clock.now += 0.1
+    write(tmp_path, {"sys/fs/cgroup/a/cpu.stat": "usage_usec 1000000\n"})
+    assert profiler.sample({}).cpu_used_cores is None, "another account"
+    clock.now += 0.1
+    write(tmp_path, {"sys/fs/cgroup/a/cpu.stat": "usage_usec 1060000\n"})
+    assert profiler.sample({}).cpu_used_cores == pytest.approx(0.6)
+    assert profiler.problem is None
+
+
 def test_machine_with_less_memory_left_than_the_group_may_use_tells_so(tmp_path: Path) -> None:
     files = {
         "proc/self/mountinfo": V2,
