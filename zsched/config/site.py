@@ -14,9 +14,6 @@ from zsched.config.security import ENCRYPTED
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Cell
 
-ENOUGH = 2
-"""Gateways of a cell: with one, its machine's death hides the cell."""
-
 
 def read_site(section: Section, folder: Path, out: Collector) -> tuple[Cell, ...]:
     """The other cells, sorted by name, with what is wrong with them reported."""

@@ -28,7 +28,7 @@ from zsched.core.events import (
     WorkerJobs,
 )
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
-from zsched.core.values.plan import Role, Route, RoutePlan
+from zsched.core.values.plan import Route
 from zsched.core.values.struct import Struct
 
 
@@ -236,7 +236,6 @@ class SlotLost(Struct, frozen=True, kw_only=True):
     samples: int
 
 
-RelayCommand = RoutePlan | Role | WorkerWatch | TaskEnded | RelayStop
 RelayReport = (
     RelayStarted
     | WorkerSeen
