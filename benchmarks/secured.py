@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.secured [--rounds 3] [--hops 200] [--takeovers 1] [--idle 10]``. Fleets of two robots and two
 edges on one machine, `reliable` streams; those that are not measured stand still (SIGSTOP). The round trip is that of
-an application on robot1's local side: relay, owner's worker, relay. A commit is `zsched weights`, until the answer. A
+an application on robot1's local side: relay, owner's worker, relay. A commit is `zsched tune`, until the answer. A
 takeover: the owner is killed, until the first answer to a message that was sent afterwards. CPU is a robot's daemon and
 relay, of one core. At the end robot1 of the secured fleet gets a renewed certificate, and begins anew while a 100 Hz
 stream runs.
@@ -34,7 +34,7 @@ from zsched.adapters.host.operator_client import ask
 from zsched.errors import AdapterError
 from zsched.pki.authority import opened
 from zsched.sessions.config import client_config
-from zsched_lab.fleet.testbed import TASK, Testbed, TestbedError, echo_fleet
+from zsched_lab.fleet.testbed import Testbed, TestbedError, echo_fleet
 
 ROBOT, KIB, MIB = "robot1", 1 << 10, 1 << 20
 OPTIONS: dict[str, Any] = {"robots": 2, "edges": 2, "stream_class": "reliable"}
@@ -166,9 +166,8 @@ def takeover(bed: Testbed, app: Application) -> float:
 
 def commit(bed: Testbed, cpu: float) -> float:
     """Milliseconds that new weights take, with its answer."""
-    request = {"verb": "weights", "task": TASK, "cpu": cpu, "memory": 1 - cpu, "network": 0.0}
     began = time.monotonic()
-    ask(places.socket_path(bed.folder, ROBOT), request, 5.0)
+    bed.weigh(ROBOT, cpu)
     return 1000 * (time.monotonic() - began)
 
 

@@ -275,18 +275,16 @@ def test_bad_frames_only_raise_counters(bed: Testbed) -> None:
 def test_weights_change_on_the_running_fleet_for_every_robot(bed: Testbed) -> None:
     """The parameter server: one command, committed like an allocation, in force at every robot; owner untouched."""
     owner = bed.wait_settled()
-    request = {"verb": "weights", "task": "echo", "cpu": 0.2, "memory": 0.7, "network": 0.1}
-    answer = ask(socket_path(bed.folder, "edge3"), request)
+    answer = bed.weigh("edge3", 0.2)
     assert answer["outcome"] == "ok", answer
 
     def everywhere() -> bool:
-        expected = {"cpu": 0.2, "memory": 0.7, "network": 0.1, "gauges": {}}
+        expected = {"cpu": 0.2, "memory": 0.8, "network": 0.0, "gauges": {}}
         return all(bed.task(node)["tuning"]["weights"] == expected for node in bed.names)
 
     bed.wait(everywhere, 60, "the weights everywhere")
     assert bed.task("robot1")["owner"] == owner
-    bad = ask(socket_path(bed.folder, "edge3"), {**request, "cpu": 0.9})
-    assert bad["outcome"] == "invalid"
+    assert "is not in [0, 1]" in bed.weigh("edge3", 1.5)["error"]
 
 
 def test_remote_status_answers_for_any_node(bed: Testbed) -> None:

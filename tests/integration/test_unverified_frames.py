@@ -45,7 +45,7 @@ from zsched.core.values.messages import (
     Learnt,
     Prepare,
     Promise,
-    SetWeights,
+    TuneTask,
     fleet_answer,
     fleet_question,
 )
@@ -75,7 +75,7 @@ ADOPTED = AdoptDocument(base_revision=1, document="0d", tasks=(("merge", False),
 SETTLED = replace(ADOPTED, settled=True)
 ELECTORATE = electorate_hash(FLEET)
 UNDER: dict[str, Any] = {"electorate": ELECTORATE, "generation_id": FIRST.generation_id, "number": FIRST.number}
-WEIGHTS = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0, asked=Asked(by="bob@robot1"))
+WEIGHTS = TuneTask(task="merge", tuning=tuning_of(1.0, 0.0), base_revision=VALUE.revision, asked=Asked(by="bob@robot1"))
 REMOVAL = ChangeFleet(remove_elector="robot3", asked=Asked(by="ada@edge1"))
 
 QUIET_S = 0.5
@@ -320,7 +320,7 @@ def test_a_command_for_another_life_or_said_once_more_leaves_nothing_on_disk(
     ana, key, frame = of(pki, "ana"), KEYS.command("robot1", "ana"), wire.encode(WEIGHTS)
     first = ana.seal(Act.QUESTION, key, frame, life=LIFE)
     send(session, Act.QUESTION, key, frame, first)
-    said = b"SetWeights came, signed by ana.operator"
+    said = b"TuneTask came, signed by ana.operator"
     until(lambda: said in machine.files().get("decisions.ndjson", (0, b""))[1], "the command")
     register = machine.node.registers["merge"]
     until(lambda: register.state.promised.counter > 0 and not register.is_busy, "its end: nobody answers its ballots")
@@ -375,7 +375,7 @@ class Electors:
 )
 @pytest.mark.parametrize("kind", [Promise, Accepted])
 def test_votes_with_wrong_seals_leave_nothing_on_disk_and_with_right_ones_they_do(
-    kind: type, order: SetWeights | ChangeFleet, machine: Machine, session: zenoh.Session, pki: Path
+    kind: type, order: TuneTask | ChangeFleet, machine: Machine, session: zenoh.Session, pki: Path
 ) -> None:
     """The node asks for its own user, and is no elector: nothing of its own round is on its disk.
 

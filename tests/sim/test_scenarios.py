@@ -23,7 +23,9 @@ import pytest
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core import events as ev
 from zsched.core.values.fleet import Fleet, WorkerSpec
-from zsched.core.values.messages import SetWeights
+from zsched.core.values.messages import TuneTask
+from zsched.core.values.model import Asked, Weights
+from zsched.core.values.struct import replace
 from zsched_lab.sim.simulator import CORES, Simulator
 
 FOLDER = Path(__file__).parent / "scenarios"
@@ -120,8 +122,10 @@ class Scene:
 
     def retune(self, words: list[str]) -> None:
         cpu = float(words[1])
-        command = SetWeights(task=TASK, cpu=cpu, memory=1.0 - cpu, network=0.0)
-        self.sim.deliver(self.sim.machines[words[0]], ev.WeightsCommanded(request=1, command=command))
+        value = self.sim.node(words[0]).registers[TASK].value
+        tuning = replace(value.tuning, weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0))
+        command = TuneTask(task=TASK, tuning=tuning, base_revision=value.revision, asked=Asked(by="ada@robot1"))
+        self.sim.deliver(self.sim.machines[words[0]], ev.TuneCommanded(request=1, command=command))
 
     def values(self, _words: list[str]) -> list[str]:
         found = []

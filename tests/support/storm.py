@@ -9,7 +9,7 @@ from random import Random
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.beats import beat_of
-from support.fleets import fleet_of
+from support.fleets import fleet_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
 from zsched.core import events as ev
@@ -34,8 +34,8 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    SetWeights,
     TakeCertificate,
+    TuneTask,
     Utilities,
     fleet_answer,
     fleet_question,
@@ -418,10 +418,10 @@ class Storm:
             return ev.CertificateSent(request=self.number(), command=TakeCertificate(certificate=Text("pem")))
         if self.rng.random() < 0.1:
             return self.rehearsal()
-        base = self.rng.choice((None, self.number()))
-        cpu = self.rng.choice((0.25, 0.75, 2.0))
-        command = SetWeights(task=self.task(), cpu=cpu, memory=1.0 - cpu, network=0.0, base_revision=base)
-        return ev.WeightsCommanded(request=self.number(), command=command)
+        tuning = tuning_of(*self.rng.choice(((0.25, 0.75), (0.75, 0.25))))
+        asked = Asked(by="ada@robot1")
+        command = TuneTask(task=self.task(), tuning=tuning, base_revision=self.rng.randrange(3), asked=asked)
+        return ev.TuneCommanded(request=self.number(), command=command)
 
     def problem(self) -> ev.Event:
         if self.rng.random() < 0.5:

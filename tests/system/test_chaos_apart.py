@@ -27,7 +27,7 @@ from zsched.paths import socket_path
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.chaos import TWO_CLASSES
 from zsched_lab.fleet.netbed import Netbed, Probe, Received
-from zsched_lab.fleet.testbed import TASK, Json, echo_fleet
+from zsched_lab.fleet.testbed import Json, echo_fleet
 
 pytestmark = [pytest.mark.long, pytest.mark.root]
 
@@ -153,8 +153,7 @@ def test_a_node_whose_file_names_other_electors_than_its_state_is_no_elector_and
         assert "another electorate" in said
         assert "no valid state file" not in said, "it is whole"
         assert status(bed)["quorum"]["this_node"] == "other_electorate"
-        weights = {"verb": "weights", "task": TASK, "cpu": 0.6, "memory": 0.4, "network": 0.0}
-        assert ask(socket_path(bed.folder, "robot1"), weights, 5.0)["outcome"] == "ok", "two of three agree without it"
+        assert bed.weigh("robot1", 0.6)["outcome"] == "ok", "two of three agree without it"
         bed.wait(lambda: status(bed)["tasks"][0]["revision"] == bed.task("robot1")["revision"], 60, "it hears of it")
     finally:
         process.terminate()

@@ -49,11 +49,6 @@ class Bed(Netbed):
     __test__ = False
     app_on_robot1: Probe
 
-    def weigh(self, node: str, cpu: float) -> Json:
-        """Change the weights: something to agree on."""
-        request = {"verb": "weights", "task": TASK, "cpu": cpu, "memory": round(1 - cpu, 6), "network": 0.0}
-        return ask(socket_path(self.folder, node), request, 5.0)
-
     def agree(self, node: str, cpu: float) -> None:
         """Change the weights, as often as it takes: the fleet may be busy with something else."""
         self.wait(lambda: self.weigh(node, cpu).get("outcome") == "ok", 60, f"an agreement by {node}")

@@ -55,7 +55,7 @@ READS = frozenset({"access", "explain", "fleet", "history", "lines", "log", "reh
 """Asked twice they change nothing."""
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
-AGREED = frozenset({"change", "hold", "move", "tune", "weights"})
+AGREED = frozenset({"change", "hold", "move", "tune"})
 """Orders whose end comes when the electors have agreed, or cannot."""
 ORDER_TIMEOUT_S = 62.0
 """Above a daemon's own limit for these by any fleet's timing (60 s): one that answers nothing then is frozen."""

@@ -29,7 +29,6 @@ from zsched.core.values.messages import (
     ReadLines,
     Refused,
     RestartTask,
-    SetWeights,
     TakeCertificate,
     TuneTask,
     Utilities,
@@ -368,13 +367,6 @@ class StatusAsked(Struct, frozen=True, kw_only=True):
     request: int
 
 
-class WeightsCommanded(Struct, frozen=True, kw_only=True):
-    """An operator changes a task's weights."""
-
-    request: int
-    command: SetWeights
-
-
 class MoveCommanded(Struct, frozen=True, kw_only=True):
     """An operator hands a task over to another node."""
 
@@ -561,7 +553,6 @@ Event = (
     | StreamsCounted
     | RelayChanged
     | StatusAsked
-    | WeightsCommanded
     | MoveCommanded
     | HoldCommanded
     | TuneCommanded
@@ -612,6 +603,4 @@ def commanded(request: int, command: Command, *, is_near: bool = False) -> Event
         return HistoryAsked(request=request, command=command)
     if isinstance(command, ChangeFleet):
         return FleetCommanded(request=request, command=command)
-    if isinstance(command, ReadFleet):
-        return FleetReadAsked(request=request, command=command)
-    return WeightsCommanded(request=request, command=command)
+    return FleetReadAsked(request=request, command=command)

@@ -7,7 +7,6 @@ Knows: the words of every request, which answers are awaited. Does not know: wha
 from __future__ import annotations
 
 import itertools
-import math
 import queue
 import threading
 from collections.abc import Callable
@@ -19,7 +18,6 @@ from zsched.core.report import plain, snapshot_json
 from zsched.core.values.decision import Decision, Explanation
 from zsched.core.values.document import Document, Flag, Rollout, Text
 from zsched.core.values.fleet import Timing
-from zsched.core.values.gauges import GAUGES
 from zsched.core.values.messages import (
     Agreed,
     Asking,
@@ -37,7 +35,6 @@ from zsched.core.values.messages import (
     ReadHistory,
     ReadLines,
     RestartTask,
-    SetWeights,
     TakeCertificate,
     TuneTask,
     WorkerLines,
@@ -146,23 +143,6 @@ class Desk:
             slot = self._waiting.get(number)
         if slot is not None:
             slot.put(value)
-
-
-def _weights_of(request: dict[str, Any]) -> SetWeights:
-    base = _whole(request, "base_revision")
-    cpu, memory, network = (float(request[name]) for name in ("cpu", "memory", "network"))
-    gauges = tuple((gauge.name, float(request[gauge.name])) for gauge in GAUGES if request.get(gauge.name))
-    if not all(map(math.isfinite, (cpu, memory, network, *dict(gauges).values()))):
-        raise ValueError("expected finite numbers")
-    return SetWeights(
-        task=str(request["task"]),
-        cpu=cpu,
-        memory=memory,
-        network=network,
-        base_revision=base,
-        gauges=tuple(sorted(gauges)),
-        asked=_asked_of(request) if "by" in request else None,
-    )
 
 
 def _asked_of(request: dict[str, Any]) -> Asked:
@@ -287,7 +267,6 @@ def _rehearsals_of(request: dict[str, Any]) -> ReadRehearsals:
 
 
 _COMMANDS: dict[str, Callable[[dict[str, Any]], Command]] = {
-    "weights": _weights_of,
     "move": _move_of,
     "hold": _hold_of,
     "tune": _tune_of,

@@ -53,7 +53,6 @@ KINDS: dict[str, tuple[type, int]] = {
     "ask_document": (messages.AskDocument, SMALL),
     "document": (document.Document, LARGE),
     "learnt": (messages.Learnt, LARGE),
-    "set_weights": (messages.SetWeights, SMALL),
     "move_task": (messages.MoveTask, SMALL),
     "hold_task": (messages.HoldTask, SMALL),
     "tune_task": (messages.TuneTask, SMALL),

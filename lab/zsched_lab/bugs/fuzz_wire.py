@@ -48,7 +48,7 @@ from zsched.core.values.messages import (
     Promise,
     ReadHistory,
     Refused,
-    SetWeights,
+    TuneTask,
     Utilities,
     Votes,
     fleet_answer,
@@ -253,7 +253,7 @@ _EVENTS: dict[type[Any], Callable[[Any], ev.Event]] = {
     FleetQuestion: lambda v: ev.FleetAsked(request=1, asker=v.ballot.node, question=v),
     FleetAnswer: lambda v: ev.FleetAnswered(answer=v),
     ChangeFleet: lambda v: ev.FleetCommanded(request=1, command=v),
-    SetWeights: lambda v: ev.WeightsCommanded(request=1, command=v),
+    TuneTask: lambda v: ev.TuneCommanded(request=1, command=v),
     ev.WorkerJobs: lambda v: v,  # of this node's own worker, by way of its relay
 }
 _SAMPLE = DeviceSample(

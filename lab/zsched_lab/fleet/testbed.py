@@ -231,6 +231,14 @@ class Testbed:
             raise AdapterError(str(answer["error"]))
         return answer
 
+    def weigh(self, node: NodeId, cpu: float) -> Json:
+        """Have a node change the task's weights, to ``cpu`` and the rest for memory; its answer."""
+        told = self.task(node)
+        weights = {"cpu": cpu, "memory": round(1.0 - cpu, 6), "network": 0.0}
+        request = {"verb": "tune", "task": TASK, "by": f"test@{node}", "base_revision": told["revision"]}
+        request["tuning"] = {**told["tuning"], "weights": weights}
+        return ask(places.socket_path(self.folder, node), request, 5.0)
+
     def task(self, node: NodeId) -> Json:
         """The first task's block in one daemon's status."""
         found: Json = self.status(node)["tasks"][0]

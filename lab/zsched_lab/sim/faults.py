@@ -15,9 +15,10 @@ from random import Random
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.fleet import lease_terms
-from zsched.core.values.messages import CommandOutcome, SetWeights
-from zsched.core.values.model import NodeId
+from zsched.core.values.messages import CommandOutcome, TuneTask
+from zsched.core.values.model import NodeId, Weights
 from zsched.core.values.quorum import majority
+from zsched.core.values.struct import replace
 from zsched.errors import InvariantError
 from zsched_lab.sim.checks import DisagreementError
 from zsched_lab.sim.clocks import slew
@@ -25,7 +26,7 @@ from zsched_lab.sim.disk_faults import DiskFaults
 from zsched_lab.sim.link_faults import SMALL_DELAY_S, LinkFaults
 from zsched_lab.sim.links import Pair
 from zsched_lab.sim.network import Weather
-from zsched_lab.sim.orders import Orders
+from zsched_lab.sim.orders import BY, Orders
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.rest import AT_MOST_S
 from zsched_lab.sim.rollout import Rollouts
@@ -114,7 +115,7 @@ class Stage:
     _busy: dict[NodeId, float] = field(default_factory=dict)
     _rng: Random = field(init=False)
     _prefix: float = 0.0
-    _requests: dict[int, SetWeights] = field(default_factory=dict)
+    _requests: dict[int, TuneTask] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         plan = self.plan
@@ -248,7 +249,7 @@ class Stage:
             if command is None or answer.result.outcome is not CommandOutcome.OK:
                 continue
             values = [value for (task, _), value in self.sim.learnt.items() if task == command.task]
-            if not any(value.tuning.weights.cpu == command.cpu for value in values):
+            if not any(value.tuning.weights == command.tuning.weights for value in values):
                 raise InvariantError(f"{command} was answered {answer.result}, and no revision holds it")
 
     # --- faults ------------------------------------------------------------------------------------------------------
@@ -383,9 +384,13 @@ class Stage:
         machine, task = self.scene.machine(fault), self._rng.choice(self.sim.fleet.tasks)
         number = len(self._requests) + 1
         cpu = fault.size + number / 1024  # every command has weights of its own
-        command = SetWeights(task=task.name, cpu=cpu, memory=1.0 - cpu, network=0.0)
-        self._requests[number] = command
-        self.sim.deliver(machine, ev.WeightsCommanded(request=number, command=command))
+        register = None if machine.node is None else machine.node.registers.get(task.name)
+        if register is not None:
+            tuning = replace(register.value.tuning, weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0))
+            base = register.value.revision
+            command = TuneTask(task=task.name, tuning=tuning, base_revision=base, asked=BY)
+            self._requests[number] = command
+            self.sim.deliver(machine, ev.TuneCommanded(request=number, command=command))
         self.sim.deliver(machine, ev.StatusAsked(request=number))
 
     def _set_load(self, fault: Fault) -> None:

@@ -52,7 +52,6 @@ from zsched.core.values.messages import (
     MoveTask,
     Prepare,
     ReadLines,
-    SetWeights,
     TuneTask,
     Utilities,
     Votes,
@@ -467,8 +466,8 @@ def test_a_daemon_is_ended_for_good_on_its_own_machine_only(house: House) -> Non
 
 
 def test_desk_refuses_what_is_no_request(house: House) -> None:
-    weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
     order = {"task": "merge", "by": "ada@robot1"}
+    tune = {**order, "verb": "tune", "tuning": TUNING, "base_revision": 3}
     for request, says in (
         (
             {"verb": "fly"},
@@ -498,14 +497,9 @@ def test_desk_refuses_what_is_no_request(house: House) -> None:
         ({"verb": "status", "node": 5}, "node: 5 is not a name"),
         ({"verb": "status", "node": "*"}, "node: '*' is not a name"),
         ({"verb": "status", "node": "a/b"}, "node: 'a/b' is not a name"),
-        ({"verb": "weights"}, "weights: 'cpu' is missing"),
-        ({**weights, "task": "No Name"}, "weights: weights.task: 'No Name' is not a name"),
-        ({**weights, "cpu": "much"}, "weights: could not convert"),
-        ({**weights, "cpu": float("nan")}, "weights: expected finite numbers"),
-        ({**weights, "cpu": 10**400}, "weights: int too large to convert to float"),
-        ({**weights, "cpu": [1]}, "weights: float() argument"),
-        ({**weights, "base_revision": "3"}, "weights: base_revision: expected a whole number, not '3'"),
-        ({**weights, "base_revision": True}, "weights: base_revision: expected a whole number, not True"),
+        ({**tune, "task": "No Name"}, "tune: tune.task: 'No Name' is not a name"),
+        ({**tune, "base_revision": "3"}, "tune: base_revision: expected a whole number, not '3'"),
+        ({**tune, "base_revision": True}, "tune: base_revision: expected a whole number, not True"),
     ):
         answer = house.desk.answer(request)
         assert answer["error"].startswith(says), answer
@@ -592,8 +586,8 @@ def test_desk_answers_several_at_once_each_with_its_own(house: House) -> None:
     answers: dict[int, dict[str, Any]] = {}
 
     def ask(number: int) -> None:
-        weights = {"cpu": 1.0, "memory": 0.0, "network": 0.0, "base_revision": number}
-        answers[number] = house.desk.answer({"verb": "weights", "task": "merge", **weights})
+        tune = {"verb": "tune", "task": "merge", "tuning": TUNING, "base_revision": number, "by": "ada@robot1"}
+        answers[number] = house.desk.answer(tune)
 
     threads = [threading.Thread(target=ask, args=(number,)) for number in range(8)]
     for thread in threads:
@@ -638,7 +632,7 @@ def test_an_order_that_the_loop_tells_no_end_of_may_have_been_carried_out(
 def test_desk_asks_other_nodes_over_the_bus_and_hands_its_errors_on(house: House) -> None:
     waited: list[float] = []
 
-    def ask_node(node: str, command: SetWeights | None, within_s: float) -> CommandResult:
+    def ask_node(node: str, command: TuneTask | None, within_s: float) -> CommandResult:
         waited.append(within_s)
         if node == "edge1":
             assert command is not None
@@ -648,13 +642,13 @@ def test_desk_asks_other_nodes_over_the_bus_and_hands_its_errors_on(house: House
 
     house.desk._bus = SimpleNamespace(ask_node=ask_node)  # type: ignore[assignment]
     house.desk.adopt(WAN)
-    weights = {"verb": "weights", "task": "merge", "cpu": 1, "memory": 0, "network": 0}
-    assert house.desk.answer({**weights, "node": "edge1"})["outcome"] == "ok"
+    tune = {"verb": "tune", "task": "merge", "tuning": TUNING, "base_revision": 3, "by": "ada@robot1"}
+    assert house.desk.answer({**tune, "node": "edge1"})["outcome"] == "ok"
     for node in ("edge2", "edge3"):
         assert f"{node} did not answer" in house.desk.answer({"verb": "status", "node": node})["error"]
-    assert "edge2 did not answer" in house.desk.answer({**weights, "node": "edge2"})["error"], "nobody has taken it"
+    assert "edge2 did not answer" in house.desk.answer({**tune, "node": "edge2"})["error"], "nobody has taken it"
     unsure = {"outcome": "unknown", "detail": "edge3 did not answer within 14 s", "revision": None}
-    assert house.desk.answer({**weights, "node": "edge3"}) == unsure
+    assert house.desk.answer({**tune, "node": "edge3"}) == unsure
     assert waited == [14.0, 3.0, 3.0, 14.0, 14.0], "a question has 3 s, and an order what the fleet's timing gives it"
     assert house.events() == [], "the loop is not asked for another node"
 

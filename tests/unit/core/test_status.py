@@ -1194,9 +1194,9 @@ def test_counters_of_all_parts_stand_in_one_sorted_list() -> None:
 def test_a_command_is_told_with_the_name_of_its_certificate() -> None:
     node = make()
     for task in ("merge", ""):
-        batch = node.handle(ev.Commanded(by="ana.operator", what="SetWeights", task=task), 100.0)
+        batch = node.handle(ev.Commanded(by="ana.operator", what="TuneTask", task=task), 100.0)
         stories = [one for one in batch if isinstance(one, RecordStory)]
-        assert [(one.text, one.task) for one in stories] == [("SetWeights came, signed by ana.operator", task)]
+        assert [(one.text, one.task) for one in stories] == [("TuneTask came, signed by ana.operator", task)]
 
 
 # --- the JSON --------------------------------------------------------------------------------------------------------

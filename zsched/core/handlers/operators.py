@@ -1,4 +1,4 @@
-"""Operators at the door: status, explanations, weights, workers to restart, and the order to stop.
+"""Operators at the door: status, explanations, workers to restart, and the order to stop.
 
 Knows: which stage each command concerns. Does not know: how the status is put together (`zsched.core.status`), how a
 change is agreed.
@@ -21,10 +21,6 @@ from zsched.core.values.profile import WorkerState
 
 def _on_status(node: Stages, event: ev.StatusAsked, todo: ToDo, now: float) -> None:
     todo.add(do.AnswerStatus(request=event.request, snapshot=build_snapshot(node, now)))
-
-
-def _on_weights(node: Stages, event: ev.WeightsCommanded, todo: ToDo, now: float) -> None:
-    node.agreement.retune(event, todo, now)
 
 
 def _record(node: Stages, task: TaskId, asked: Asked | None, what: str, todo: ToDo) -> None:
@@ -111,7 +107,6 @@ def _on_stop(node: Stages, _event: ev.StopRequested, todo: ToDo, _now: float) ->
 
 HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.StatusAsked: _on_status,
-    ev.WeightsCommanded: _on_weights,
     ev.ExplanationAsked: _on_explanation,
     ev.RestartCommanded: _on_restart,
     ev.LinesAsked: _on_lines,

@@ -26,11 +26,10 @@ from zsched.core.values.model import (
     V,
     check_counter,
     check_name,
-    check_readings,
 )
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 from zsched.core.values.struct import Struct, replace
-from zsched.core.values.words import MAX_ASKER, Readings, check_range
+from zsched.core.values.words import MAX_ASKER, check_range
 
 _CURSOR: Final = re.compile(r"([0-9]{1,20}:[0-9]{1,15})?")
 """A file of the log and an offset in it (`zsched.adapters.host.decision_log`)."""
@@ -307,27 +306,6 @@ class Utilities(Struct, frozen=True, kw_only=True):
         check_name("utilities.voter", self.voter)
 
 
-class SetWeights(Struct, frozen=True, kw_only=True):
-    """Operator command: change Eq. 4's weights of one task on the whole fleet, through the register.
-
-    ``base_revision`` is the revision the operator saw; ``None`` means "whatever is current at this node".
-    """
-
-    task: TaskId
-    cpu: float
-    memory: float
-    network: float
-    base_revision: int | None = None
-    gauges: Readings = ()
-    """Weights of gauges."""
-    asked: Asked | None = None
-    """``None``: by an older program."""
-
-    def __post_init__(self) -> None:
-        check_name("weights.task", self.task)
-        check_readings("weights", self.gauges, 0.0, 1.0)
-
-
 class ExplainTask(Struct, frozen=True, kw_only=True):
     """Operator question to one node: its last judgement of a task, with every figure."""
 
@@ -480,8 +458,7 @@ class TuneTask(Struct, frozen=True, kw_only=True):
 
 
 Command = (
-    SetWeights
-    | Strike
+    Strike
     | KeepRehearsal
     | ReadRehearsals
     | ExplainTask
@@ -496,11 +473,11 @@ Command = (
     | ReadFleet
 )
 COMMANDS: tuple[type, ...] = get_args(Command)
-Ordered = SetWeights | Strike | KeepRehearsal | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
+Ordered = Strike | KeepRehearsal | RestartTask | MoveTask | HoldTask | TuneTask | ChangeFleet
 """Commands that carry who gives them (``asked``)."""
 Asking = ExplainTask | ReadLines | ReadHistory | ReadFleet | ReadRehearsals
 """Commands that only ask: given twice they change nothing."""
-Agreed = SetWeights | MoveTask | HoldTask | TuneTask | ChangeFleet
+Agreed = MoveTask | HoldTask | TuneTask | ChangeFleet
 """Orders whose end comes when the electors have agreed, or cannot. A node knows the end of the others at once."""
 
 

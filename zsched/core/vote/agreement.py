@@ -42,7 +42,7 @@ from zsched.core.values.struct import replace
 from zsched.core.values.words import CREATION_STEP, shown
 from zsched.core.vote.acceptor import Acceptor
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fleet_fit, is_proven
-from zsched.core.vote.commands import answer_end, refuse_gone, wanted_retune
+from zsched.core.vote.commands import answer_end, refuse_gone
 from zsched.core.vote.generations import lost_text, moved_text
 from zsched.core.vote.lease import Leases
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, Questions
@@ -818,12 +818,6 @@ class Agreement:
             todo.end(task, change, RoundOutcome.NO_QUORUM)
         else:
             self.registers[task].propose(change, todo, now)
-
-    def retune(self, event: ev.WeightsCommanded, todo: ToDo, now: float) -> None:
-        """An operator changes a task's weights; the answer comes when the change has ended."""
-        change = wanted_retune(event, self.registers, todo)
-        if change is not None:
-            self.propose(event.command.task, change, todo, now)
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""

@@ -5,17 +5,12 @@ Knows: commands, outcomes in words. Does not know: rounds (`zsched.core.register
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
-from zsched.core.values.change import Ended, Retune, RoundOutcome, SetLeased
+from zsched.core.values.change import Ended, RoundOutcome, SetLeased
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.core.values.model import Allocation, TaskId, Weights
-from zsched.core.values.struct import replace
-from zsched.core.values.words import shown, told_of_silence
+from zsched.core.values.model import Allocation
+from zsched.core.values.words import told_of_silence
 
 _ENDED = {
     RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
@@ -24,31 +19,6 @@ _ENDED = {
     RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, ""),
     RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
 }
-
-
-def wanted_retune(event: ev.WeightsCommanded, registers: Mapping[TaskId, TaskRegister], todo: ToDo) -> Retune | None:
-    """The change that an operator's new weights mean; ``None``: the answer is given already."""
-    command, request = event.command, event.request
-    register = registers.get(command.task)
-    if register is None:
-        known = ", ".join(sorted(registers))
-        _refuse(request, CommandOutcome.INVALID, f"no task {command.task!r}; tasks: {known}", todo)
-        return None
-    try:
-        weights = Weights(cpu=command.cpu, memory=command.memory, network=command.network, gauges=command.gauges)
-    except ValueError as error:
-        _refuse(request, CommandOutcome.INVALID, str(error), todo)
-        return None
-    value = register.value
-    if command.base_revision not in (None, value.revision):
-        detail = f"revision is {shown(value.revision)}, not {shown(command.base_revision)}"
-        _refuse(request, CommandOutcome.CONFLICT, detail, todo)
-    elif weights == value.tuning.weights:
-        _refuse(request, CommandOutcome.UNCHANGED, _ENDED[RoundOutcome.UNCHANGED][1], todo)
-    else:
-        tuning = replace(value.tuning, weights=weights)
-        return Retune(base_revision=value.revision, tuning=tuning, request=request, asked=command.asked)
-    return None
 
 
 def refuse_gone(ended: Ended, todo: ToDo) -> None:

@@ -50,7 +50,6 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    SetWeights,
     TuneTask,
     Utilities,
     Votes,
@@ -74,7 +73,7 @@ PROFILE = profile_of("a", cpu_cores=1, cpu_used_cores=None, memory_mb=10, memory
 PROPOSAL = proposal_of("a")
 LEARNT = Learnt(node="a", values=(VALUE,))
 RESULT = CommandResult(outcome=CommandOutcome.OK, detail="done", revision=4)
-COMMAND = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
+COMMAND = TuneTask(task="merge", tuning=tuning_of(), base_revision=3, asked=Asked(by="ada@robot1"))
 
 
 class Peer:
@@ -145,7 +144,6 @@ ORDERS: tuple[Ordered, ...] = (
     MoveTask(task="merge", node="edge1", asked=BOB),
     HoldTask(task="merge", hold=Hold.PAUSE, asked=BOB),
     TuneTask(task="merge", tuning=tuning_of(), base_revision=3, asked=BOB),
-    SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0, asked=BOB),
     RestartTask(task="merge", asked=BOB),
     Strike(step=Step.WORKER, task="merge", asked=BOB),
     KeepRehearsal(task="merge", name="one", body=Text("{}"), told="", asked=BOB),
@@ -412,7 +410,7 @@ def test_a_gone_nodes_link_is_ended_and_made_anew(mesh: tuple[Peer, Peer, Peer])
 def test_operator_asks_and_commands_another_node(mesh: tuple[Peer, Peer, Peer]) -> None:
     a, b, _ = mesh
     answers: list[object] = []
-    for command, kind, answer in ((None, ev.StatusAsked, SNAPSHOT), (COMMAND, ev.WeightsCommanded, RESULT)):
+    for command, kind, answer in ((None, ev.StatusAsked, SNAPSHOT), (COMMAND, ev.TuneCommanded, RESULT)):
         asking = threading.Thread(target=lambda c=command: answers.append(a.bus.ask_node("b", c, 60.0)))
         asking.start()
         asked: Any = b.next(kind)
@@ -429,7 +427,7 @@ def test_a_command_is_answered_however_many_questions_come_meanwhile(
     answers: list[object] = []
     asking = threading.Thread(target=lambda: answers.append(a.bus.ask_node("b", COMMAND, 60.0)))
     asking.start()
-    command = b.next(ev.WeightsCommanded)
+    command = b.next(ev.TuneCommanded)
     monkeypatch.setattr(open_questions, "monotonic_s", lambda: monotonic_s() + MOST_ORDER_S)
     c.bus.ask_learnt("b", 2.0)
     b.next(ev.LearntAsked)
@@ -514,7 +512,7 @@ def test_operator_hears_that_a_node_does_not_answer_and_whether_it_may_have_take
     with pytest.raises(AdapterError, match=f"{node} did not answer within {within_s:g} s") as silent:
         mesh[0].bus.ask_node(node, COMMAND, within_s)
     assert isinstance(silent.value.__cause__, TimeoutError) == is_there
-    assert bool(mesh[1].of(ev.WeightsCommanded)) == is_there
+    assert bool(mesh[1].of(ev.TuneCommanded)) == is_there
 
 
 def test_answer_in_another_s_name_is_foreign(mesh: tuple[Peer, Peer, Peer]) -> None:

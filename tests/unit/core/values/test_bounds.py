@@ -29,7 +29,6 @@ from zsched.core.events import (
     RestartCommanded,
     StrikeCommanded,
     TuneCommanded,
-    WeightsCommanded,
     WorkerJobs,
     commanded,
 )
@@ -61,7 +60,6 @@ from zsched.core.values.messages import (
     Refusal,
     Refused,
     RestartTask,
-    SetWeights,
     TakeCertificate,
     TuneTask,
     WorkerLines,
@@ -182,7 +180,6 @@ NAMES = [
     (REFUSED, "elector", "refused"),
     (REFUSED, "task", "refused"),
     (Learnt(node="e1", values=()), "node", "learnt"),
-    (SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0), "task", "weights"),
     (TROUBLE, "task", "trouble"),
     (WORD, "task", "jobs"),
     (ECHO, "node", "echo"),
@@ -280,8 +277,6 @@ def test_what_a_worker_says_of_itself_has_a_length() -> None:
 
 
 def test_each_command_is_its_own_event() -> None:
-    weights = SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0)
-    assert commanded(7, weights) == WeightsCommanded(request=7, command=weights)
     assert commanded(9, RestartTask(task="merge")) == RestartCommanded(request=9, command=RestartTask(task="merge"))
     assert commanded(9, ReadLines(task="merge")) == LinesAsked(request=9, command=ReadLines(task="merge"))
     assert commanded(9, ReadHistory()) == HistoryAsked(request=9, command=ReadHistory())
@@ -321,8 +316,8 @@ def test_a_program_names_its_user_and_neither_an_operator_nor_another_node() -> 
     assert by("ada@r2") == by("ada") == "ada@r1"
     assert by("ada@r11") == "ada@r1", "that ends with this node's name, and is another node"
     assert by("a" * MAX_ASKER) == f"{'a' * (MAX_ASKER - 3)}@r1", "as long as a name may be"
-    nobody = asked_at("r1", SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0))
-    assert isinstance(nobody, SetWeights)
+    nobody = asked_at("r1", RestartTask(task="merge"))
+    assert isinstance(nobody, RestartTask)
     assert nobody.asked == Asked(by="r1")
     assert asked_at("r1", ReadFleet()) == ReadFleet(), "a question is nobody's order"
 

@@ -12,7 +12,6 @@ from zsched.commands.common import SCHEMAS
 from zsched.core.values import gauges
 from zsched.core.values.fleet import Demand, fleet_hash
 from zsched.core.values.gauges import BY_NAME, GAUGES
-from zsched.core.values.messages import SetWeights
 from zsched.core.values.model import Tuning, Weights
 from zsched.core.values.profile import Profile
 from zsched.errors import WireError
@@ -105,7 +104,6 @@ def test_a_profile_of_an_older_program_measures_no_gauge_and_a_newer_ones_is_rea
 def test_without_gauges_no_frame_and_no_hash_differs_from_an_older_programs() -> None:
     assert "gauges" not in as_plain(tuning_of())["weights"]
     assert "gauges" not in as_plain(profile_of())
-    assert "gauges" not in as_plain(SetWeights(task="merge", cpu=1.0, memory=0.0, network=0.0))
     plain = fleet_of(task_of())
     assert fleet_hash(plain) == "be228661b030673f"
     for other in (

@@ -20,7 +20,6 @@ from zsched.core.values.messages import (
     Promise,
     Refusal,
     Refused,
-    SetWeights,
     Utilities,
     votes_of,
 )
@@ -45,7 +44,6 @@ BUILDERS: dict[str, Callable[[str], object]] = {
     ),
     "learnt.node": lambda name: Learnt(node=name, values=(VALUE,)),
     "utilities.voter": lambda name: Utilities(voter=name, vectors=()),
-    "weights.task": lambda name: SetWeights(task=name, cpu=1.0, memory=0.0, network=0.0),
 }
 
 

@@ -32,7 +32,6 @@ from zsched.core.values.messages import (
     Promise,
     Refusal,
     Refused,
-    SetWeights,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Asked, Pause, RegisterState
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
@@ -66,13 +65,9 @@ def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True, 
     return agreement
 
 
-def command(
-    cpu: float = 0.75, *, memory: float | None = None, base: int | None = None, task: str = "merge"
-) -> ev.WeightsCommanded:
-    weights = SetWeights(
-        task=task, cpu=cpu, memory=1.0 - cpu if memory is None else memory, network=0.0, base_revision=base
-    )
-    return ev.WeightsCommanded(request=42, command=weights)
+def command(cpu: float = 0.75, *, base: int = 0) -> tuple[str, Retune]:
+    """An operator's change of a task's weights."""
+    return "merge", Retune(base_revision=base, tuning=tuning_of(cpu, 1.0 - cpu), request=42)
 
 
 def answer(learnt: Learnt) -> ev.LearntReceived:
@@ -125,7 +120,7 @@ def run_dry(agreement: Agreement, effects: ToDo) -> CommandResult:
 
 def test_command_that_a_majority_accepts_is_ok_learnt_and_published() -> None:
     agreement = make()
-    effects = accepts(agreement, promises(agreement, agreed(agreement.retune, command(), 100.0)))
+    effects = accepts(agreement, promises(agreement, agreed(agreement.propose, *command(), 100.0)))
 
     result = told(effects)
     assert result is not None
@@ -136,44 +131,9 @@ def test_command_that_a_majority_accepts_is_ok_learnt_and_published() -> None:
     assert [one.learnt for one in of(effects, do.PublishLearnt)] == [agreement.learnt()]
 
 
-def test_weights_in_force_are_unchanged_without_a_round() -> None:
-    agreement = make()
-    effects = agreed(agreement.retune, command(0.5), 100.0)
-    result = told(effects)
-    assert result is not None
-    assert result.outcome is CommandOutcome.UNCHANGED
-    assert len(effects.send) == 1
-
-
-@pytest.mark.parametrize(
-    ("asked", "outcome", "says"),
-    [
-        (command(base=3), CommandOutcome.CONFLICT, "revision is 0, not 3"),
-        (command(0.9, memory=0.9), CommandOutcome.INVALID, "the sum is 1.8, not 1"),
-        (command(1.5, memory=-0.5), CommandOutcome.INVALID, "weights.cpu: 1.5 is not in [0, 1]"),
-        (command(task="other"), CommandOutcome.INVALID, "no task 'other'; tasks: merge, plan"),
-    ],
-)
-def test_command_that_cannot_be_is_refused_at_once(
-    asked: ev.WeightsCommanded, outcome: CommandOutcome, says: str
-) -> None:
-    agreement = make()
-    effects = agreed(agreement.retune, asked, 100.0)
-    result = told(effects)
-    assert result is not None
-    assert result.outcome is outcome
-    assert says in result.detail
-    assert not effects.must_persist
-    assert len(effects.send) == 1, "no round was started"
-
-
-def test_command_on_the_revision_that_is_current_starts_a_round() -> None:
-    assert of(agreed(make().retune, command(base=0), 100.0), do.SendPrepare)
-
-
 def test_command_that_another_change_overtakes_is_a_conflict() -> None:
     agreement = make()
-    agreed(agreement.retune, command(), 100.0)
+    agreed(agreement.propose, *command(), 100.0)
     result = told(agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(1),))), 100.1))
     assert result is not None
     assert (result.outcome, result.revision) == (CommandOutcome.CONFLICT, 1)
@@ -181,7 +141,7 @@ def test_command_that_another_change_overtakes_is_a_conflict() -> None:
 
 def test_command_without_a_majority_of_promises_ends_as_no_quorum() -> None:
     agreement = make()
-    effects = agreed(agreement.retune, command(), 100.0)
+    effects = agreed(agreement.propose, *command(), 100.0)
     (asked,) = of(effects, do.SendPrepare)
     promise = Promise(elector="robot1", task="merge", ballot=asked.prepare.ballot)
     effects = agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 100.0)
@@ -192,13 +152,13 @@ def test_the_only_elector_s_own_vote_that_comes_too_late_is_told_as_overload_and
     alone = fleet_of(task_of("merge", ("edge1", "robot2")), of=("edge1", *ROBOTS), electors=ROBOTS[:1])
     for fleet, says in ((FLEET, "no majority of the electors answered"), (alone, "this machine is overloaded")):
         agreement = make(fleet=fleet)
-        result = run_dry(agreement, agreed(agreement.retune, command(), 100.0))
+        result = run_dry(agreement, agreed(agreement.propose, *command(), 100.0))
         assert (result.outcome, says in result.detail) == (CommandOutcome.NO_QUORUM, True), result.detail
 
 
 def test_command_whose_accept_left_and_was_not_answered_ends_as_unknown() -> None:
     agreement = make()
-    effects = promises(agreement, agreed(agreement.retune, command(), 100.0))
+    effects = promises(agreement, agreed(agreement.propose, *command(), 100.0))
     assert of(effects, do.SendAccept)
     assert run_dry(agreement, effects).outcome is CommandOutcome.UNKNOWN
 
@@ -230,7 +190,7 @@ def test_nobody_waits_for_the_end_of_a_change_that_nobody_has_ordered(change: Mo
 
 def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
     agreement = make()
-    (asked,) = of(agreed(agreement.retune, command(), 100.0), do.SendPrepare)
+    (asked,) = of(agreed(agreement.propose, *command(), 100.0), do.SendPrepare)
     for name in ("edge1", "ghost", "ghost2"):
         promise = Promise(elector=name, task="merge", ballot=asked.prepare.ballot)
         assert agreed(agreement.on_answer, ev.ElectorAnswered(answer=promise), 100.0) == ToDo()
@@ -240,7 +200,7 @@ def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
 def test_promises_of_another_task_s_value_are_counted_and_complete_no_majority() -> None:
     agreement = make()
     held = Acceptance(ballot=ballot_of(5, "robot3"), value=allocation_of(4, task="plan"))
-    assert promises(agreement, agreed(agreement.retune, command(), 100.0), held=held) == ToDo()
+    assert promises(agreement, agreed(agreement.propose, *command(), 100.0), held=held) == ToDo()
     assert agreement.counters == {"answer_unfit": 2}
 
 
@@ -372,7 +332,7 @@ def test_an_elector_that_learns_by_its_own_round_that_a_task_is_leased_grants_it
     before = allocation_of(3, "robot2")
     agreement = make(RegisterState(task="merge", accepted=Acceptance(ballot=ballot_of(), value=before), learnt=before))
     leased = replace(before, revision=4, leased=True)
-    (asked,) = of(agreed(agreement.retune, command(), 101.0), do.SendPrepare)
+    (asked,) = of(agreed(agreement.propose, *command(base=3), 101.0), do.SendPrepare)
     ballot, held = asked.prepare.ballot, Acceptance(ballot=ballot_of(3, "robot2"), value=leased)
     for name in ROBOTS[1:]:
         promise = Promise(elector=name, task="merge", ballot=ballot, accepted=held)

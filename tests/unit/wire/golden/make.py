@@ -200,7 +200,6 @@ SAMPLES: dict[str, object] = {
         elector="robot2", task="map_merge", ballot=_BALLOT, refusal=messages.Refusal.LEASE, promised=_BALLOT
     ),
     "learnt": messages.Learnt(node="robot2", values=(_VALUE,)),
-    "set_weights": messages.SetWeights(task="map_merge", cpu=0.5, memory=0.25, network=0.25, base_revision=7),
     "move_task": messages.MoveTask(
         task="map_merge", node="edge1", asked=_ASKED, origin="edge2", base_revision=7, is_plan=True
     ),
