@@ -63,7 +63,11 @@ def shown(number: int) -> int:
 
 
 def meant(number: int | None, now: int) -> int:
-    """The epoch or revision that people mean by a number, where the present one is ``now``: ``None`` is that one."""
+    """The epoch or revision that people mean by a number, where the present one is ``now``: ``None`` is that one.
+
+    >>> meant(3, 4294967300), meant(4294967298, 4294967300), meant(None, 7)
+    (4294967299, 4294967298, 7)
+    """
     if number is None:
         return now
     return number if number >= CREATION_STEP else now - shown(now) + number
