@@ -50,6 +50,7 @@ const number = (value, digits) => (value === null || value === undefined ? "-" :
 const percent = (ratio) => (ratio === null || ratio === undefined ? "-" : `${Math.round(ratio * 100)} %`);
 const clock = (at) => new Date(at * 1000).toLocaleTimeString([], { hour12: false });
 const seconds = (at) => (typeof at === "number" ? at : Date.parse(at) / 1000);
+const shown = (epoch) => epoch % 4294967296;  // counted from 1, as the other verbs do
 const level = (ratio) => (ratio === null || ratio === undefined ? "dim" : ratio >= 0.85 ? "bad" : ratio >= 0.6 ? "warn" : "good");
 const radio = (dbm) => (dbm >= -65 ? "good" : dbm >= -75 ? "warn" : "bad");
 const colour = (node) => Math.max(state.now.status.nodes.findIndex((one) => one.name === node), 0) % 8;
@@ -156,7 +157,7 @@ function taskCard(task, view) {
   return h("div", { class: "task" },
     h("header", {}, h("h3", {}, task.name),
       h("span", { class: isFine ? "" : "bad" }, task.owner === null ? "nobody owns it" : `${task.owner}${isFine ? "" : ` is ${task.owner_state}`}`),
-      h("span", { class: "dim" }, `epoch ${task.epoch} · ${task.phase} · for ${span(task.since_s)}`),
+      h("span", { class: "dim" }, `epoch ${shown(task.epoch)} · ${task.phase} · for ${span(task.since_s)}`),
       h("button", { type: "button", click: () => toggle(task.name), "aria-expanded": String(isOpen) }, isOpen ? "close" : "explain")),
     points.length ? chart(task, view) : h("p", { class: "dim" }, "no judgement here: edges decide nothing, so ask a robot (--node)"),
     h("div", { class: "legend" }, legend),
@@ -209,8 +210,8 @@ function epochs(status, view) {
     for (const one of spans.filter((each) => each.owner && each.to > view.from)) {
       const x = name + across(Math.max(one.from, view.from), view, width - name), end = name + across(one.to, view, width - name);
       parts.push(s("rect", { class: `f${colour(one.owner)}`, x, y: y + 3, width: Math.max(end - x - 1, 2), height: row - 6, rx: 3 },
-        s("title", {}, `epoch ${one.epoch}: ${one.owner}`)));
-      if (end - x > 90) parts.push(s("text", { class: "on", x: x + 7, y: y + 17 }, `${one.owner} · ${one.epoch % 4294967296}`));
+        s("title", {}, `epoch ${shown(one.epoch)}: ${one.owner}`)));
+      if (end - x > 90) parts.push(s("text", { class: "on", x: x + 7, y: y + 17 }, `${one.owner} · ${shown(one.epoch)}`));
     }
   });
   const y = status.tasks.length * row + 14;
@@ -221,7 +222,7 @@ function epochs(status, view) {
 function moveLine(move) {
   const took = move.switched_s === null ? "" : ` (streams switched in ${(move.switched_s * 1000).toFixed(0)} ms)`;
   return h("li", {}, h("time", {}, clock(seconds(move.at))), h("b", {}, move.task),
-    ` epoch ${move.epoch}: ${move.from || "nobody"} → ${move.to || "nobody"}: ${move.reason}${took}`);
+    ` epoch ${shown(move.epoch)}: ${move.from || "nobody"} → ${move.to || "nobody"}: ${move.reason}${took}`);
 }
 
 function table(titles, rows, numbers) {
