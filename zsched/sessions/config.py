@@ -68,6 +68,9 @@ _RECEIVERS: Final[Settings] = {
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": round(DROP_WAIT_S * 1e6),
 }
 """Of sessions that applications receive outputs from."""
+STANDSTILL_S: Final = 60.0
+"""So long an application of the host may stand still: its link stays, and with it what it holds. This lease is no
+failure detector: a program that ends, or is ended, closes its link."""
 
 
 def control_config(
@@ -170,6 +173,8 @@ def local_config(side: LocalSide, *, timing: Timing = DEFAULT_TIMING) -> str:
     if side.mode is LocalMode.CLIENT:
         return client_config(connect=side.connect, timing=timing)
     settings = _peer(side.listen or (LOOPBACK_LISTEN,), side.connect, timing)
+    settings["transport/link/tx/lease"] = round(STANDSTILL_S * 1000)
+    settings[_WAIT_BEFORE_CLOSE] = round(STANDSTILL_S * 1e6)
     _set_shared_memory(settings, is_on=False)
     settings.update(_RECEIVERS)
     return _render(settings, "")

@@ -121,7 +121,7 @@ class SendQueue:
         """True while samples are about to be dropped, or (``sheds``) have been since the queue was last empty."""
         if self._sheds:
             return self._has_shed
-        return self._count > self._depth // 2 or self._bytes > MAX_BYTES // 2
+        return self._count > self._depth // 8 or self._bytes > MAX_BYTES // 2
 
     def send(self, lane: Hashable, action: Action, size: int, value: Any = None) -> int:
         """Queue a sample of ``size`` bytes; answers how many samples were dropped for it (itself: 1).

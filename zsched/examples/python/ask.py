@@ -16,8 +16,8 @@ CONFIG = {
     "mode": "client",
     "connect": {"endpoints": [ENDPOINT]},
     "scouting": {"multicast": {"enabled": False}},
-    # zenoh's default does not open where a container may lock no memory
-    "transport": {"shared_memory": {"enabled": False}},
+    # zenoh's default does not open where a container may lock no memory; it may stand still for a minute
+    "transport": {"shared_memory": {"enabled": False}, "link": {"tx": {"lease": 60_000}}},
 }
 
 

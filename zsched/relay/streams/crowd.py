@@ -9,7 +9,11 @@ for seconds. So, where there are two or more, each put first waits until every l
 none is *left behind*, while another one is ready, when it has taken nothing for `NO_ROOM_S`, or when the others have
 waited this long for it and the queue before the put runs full. As long as somebody is left behind, puts do not wait
 (DROP): zenoh drops for this receiver alone. What it may have missed is counted. After a rest, and when its link has
-room again, it is waited for like the others; of class ``latest`` the newest sample is then put once more.
+room again, it is waited for like the others; of class ``latest`` the newest sample is then put once more. While nobody
+has room nothing is put: a put that waits is not to be taken back, and zenoh ends the link that it waits for.
+
+A link that ends takes along what its sockets held. When its client dials again, what was put since it was last heard
+counts as missed: what it had read of that nobody knows.
 
 A sample that is larger than what a link holds may have begun when the receiver froze: nothing ends such a put but the
 link's end. `Crowd.look_after` ends the link, when the receiver has taken nothing for `STUCK_S`; it then dials again.
@@ -19,6 +23,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -29,7 +34,6 @@ from zsched.clock import monotonic_s
 from zsched.core.hop.serial import serial_of
 from zsched.core.values.struct import Struct
 from zsched.relay.streams.lanes import Lane
-from zsched.sessions.config import DROP_WAIT_S
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
 from zsched.sessions.send_queue import NO_ROOM_S
 
@@ -41,13 +45,12 @@ SLICE_S: Final = 0.02
 FORGIVEN_RATIO: Final = 0.5
 REST_S, MAX_REST_S = 1.0, 8.0
 """A receiver is left behind for at least this long; for twice as long when it is left again soon."""
-FITS_BYTES: Final = 96 << 10
-"""This much still fits into zenoh's queue of a link whose socket is full (two batches of 48 KiB)."""
-OVERHEAD_BYTES: Final = 48
+TOLD_BYTES: Final = 192 << 10
+"""After so much a link that was sent less than half of it leads to nobody who receives the stream."""
 SLOW_PUT_S: Final = 0.005
 MAX_CHARGE_S: Final = 0.5
 
-MAX_FEEDERS: Final = 1024
+MAX_KNOWN: Final = 1024
 
 _feeders: dict[str, None] = {}
 """Sessions of workers, in order; of this process."""
@@ -71,8 +74,19 @@ class Reader(Struct, eq=False):
     """It is left behind, at least until then (monotonic seconds)."""
     rest_s: float = 0.0
     back_at: float = 0.0
-    fits: int = FITS_BYTES
-    """Bytes that its link would still take although its socket is full."""
+    receives: bool = True
+    """Not, while its link is sent less than is put..."""
+    sent: tuple[int, int] = (0, 0)
+    """...since (bytes put, bytes sent by its link)."""
+
+    def compare(self, put: int) -> None:
+        """Whether it receives the stream, of which so many bytes have been put; nobody knows while it has no room."""
+        told = self.link.account()
+        if told is None or (put - self.sent[0] < TOLD_BYTES and not self.is_full):
+            return
+        before, self.sent = self.sent, (put, told.acked + told.held)
+        if not self.is_full:
+            self.receives = 2 * (self.sent[1] - before[1]) >= put - before[0]
 
     def look(self, now: float, *, has_room: bool) -> None:
         """Note whether it takes anything, and what that costs the others."""
@@ -80,7 +94,6 @@ class Reader(Struct, eq=False):
         was_full, self.is_full = self.is_full, not has_room
         self.cost_s = max(0.0, self.cost_s - passed * FORGIVEN_RATIO)
         if has_room:
-            self.fits = FITS_BYTES
             return
         taken = self.link.taken()
         if not was_full or taken != self.taken:
@@ -96,11 +109,6 @@ class Reader(Struct, eq=False):
         """Wait for it again, if it has rested."""
         if self.left_until is not None and now > self.left_until:
             self.left_until, self.back_at = None, now
-
-    def misses(self, size: int) -> bool:
-        """Whether a sample that is put now is lost to it, its socket being full."""
-        self.fits -= size + OVERHEAD_BYTES
-        return self.fits < 0
 
 
 class Crowd:
@@ -120,15 +128,20 @@ class Crowd:
         self._looking = threading.Lock()
         self._is_smooth = True
         """Everybody had room at the last look, and nobody is left behind."""
+        self._is_closed = False
+        self._put_count = self._put_before = self._put_bytes = 0
+        """All samples put so far, those until the last look at the links, and all bytes."""
+        self._heard: OrderedDict[str, tuple[int, int]] = OrderedDict()
+        """{session: how many had been put when it was heard and its link stayed, and when it was last heard}."""
         self._putting_since: float | None = None
         self._owed: dict[Lane, tuple[Sample, Timestamp | None]] = {}
         self._missed = 0
 
     def put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
         """Put a sample, waiting for every receiver that is not left behind."""
-        is_alone = self._look(monotonic_s())
-        left = () if is_alone else self._wait()
-        began = self._putting_since = monotonic_s()
+        left = self._wait()
+        self._put_count, self._put_bytes = self._put_count + 1, self._put_bytes + size
+        self._putting_since = monotonic_s()
         try:
             if left:
                 self._put_dropping(lane, sample, stamp)
@@ -136,13 +149,15 @@ class Crowd:
                 lane.put(sample, stamp)
         finally:
             self._putting_since = None
-        if left:
-            is_doubtful = monotonic_s() - began >= DROP_WAIT_S * 0.9  # zenoh has given up at somebody's link
-            self._note_missed(sum(reader.misses(size) for reader in left) + is_doubtful)
+        self._note_missed(len(left))
         if left and self._is_latest:
             self._owed[lane] = (sample, stamp)
         elif self._owed:
             self._owed.pop(lane, None)
+
+    def close(self) -> None:
+        """Wait for nobody any more."""
+        self._is_closed = True
 
     def forget(self, lane: Lane) -> None:
         """A lane is given back: what somebody has missed of it is counted already (`put`'s thread)."""
@@ -180,11 +195,14 @@ class Crowd:
         """
         since, now = self._putting_since, monotonic_s()
         period_s, self._cared_at = now - self._cared_at, now
-        if since is None or now - since < SLOW_PUT_S or self._look(now, period_s=SLOW_PUT_S):
+        if since is None or now - since < SLOW_PUT_S:
+            self._look(now)
+            return
+        if self._look(now, period_s=SLOW_PUT_S):
             return  # it may wait for one that has come since the put thread's own look
         full = self._full()
         self._charge(full, min(period_s, MAX_CHARGE_S))
-        if now - since < STUCK_S or len(full) == len(self._readers):
+        if now - since < STUCK_S or not self._has_ready_receiver():
             return
         for reader in full:
             if now - reader.moved_at >= STUCK_S and reader.link.cut():
@@ -197,25 +215,41 @@ class Crowd:
         """Know the links, now and then; ``True`` when there is nobody to protect from anybody."""
         with self._looking:
             if now - self._looked_at >= period_s:
-                self._looked_at = now
                 links = [link for link in self._sockets.links() if link.zid not in _feeders]
+                self._count_returned(links, now - self._looked_at)
                 self._readers = {link: self._readers.get(link) or Reader(link, now) for link in links}
+                self._looked_at, self._put_before = now, self._put_count
+                for reader in () if self._is_latest else self._readers.values():  # `latest` may go by shared memory
+                    reader.compare(self._put_bytes)
             return len(self._readers) < 2
+
+    def _count_returned(self, links: list[LinkSocket], passed_s: float) -> None:
+        """Nodes and their workers are peers, and receive nothing here."""
+        peers = {str(zid) for zid in self._session.info.peers_zid()}
+        before = self._put_before
+        for link in links:
+            known, newest = self._heard.get(link.zid, (self._put_count, before))
+            if link not in self._readers:
+                self._note_missed(0 if link.zid in peers else self._put_count - known)
+                self._heard[link.zid] = (before, before)
+            elif 0 < link.silent_s() < passed_s:  # 0: it is gone
+                self._heard[link.zid] = (newest, before)
+        while len(self._heard) > MAX_KNOWN:
+            self._heard.popitem(last=False)
 
     def _wait(self) -> tuple[Reader, ...]:
         """Wait for room at every link; returns the receivers that are left behind and have none."""
-        began = looked_at = monotonic_s()
+        looked_at = monotonic_s()
         while True:
+            self._look(monotonic_s())
             full = self._full()
             now = monotonic_s()
             self._charge(full, now - looked_at)
             looked_at = now
             waiting = [reader for reader in full if reader.left_until is None]
-            is_nobody_ready = len(full) == len(self._readers)
-            if not waiting or (is_nobody_ready and now - began > NO_ROOM_S):
-                break
+            if not waiting or self._is_closed:
+                return tuple(full)
             _ready(waiting, SLICE_S)
-        return tuple(reader for reader in full if reader.left_until is not None)
 
     def _full(self) -> list[Reader]:
         """The receivers without room now; one that has rested and has room is waited for again."""
@@ -234,8 +268,8 @@ class Crowd:
 
     def _charge(self, full: list[Reader], waited_s: float) -> None:
         """Leave behind receivers that are stalled, or have cost the others too much; ``full``: those without room."""
-        if not full or len(full) == len(self._readers):
-            return  # no ready receiver waits for them
+        if not full or not self._has_ready_receiver():
+            return  # nobody waits for them
         now, is_pressed = monotonic_s(), self._is_pressed()
         for reader in full:
             reader.cost_s += waited_s
@@ -244,6 +278,9 @@ class Crowd:
                 reader.leave(now)
                 what = "stalled" if is_stalled else "too slow"
                 _log.info("%s: %s is %s: nobody waits for it", self._expr, reader.link.name, what)
+
+    def _has_ready_receiver(self) -> bool:
+        return any(reader.receives and not reader.is_full for reader in tuple(self._readers.values()))
 
     def _put_dropping(self, lane: Lane, sample: Sample, stamp: Timestamp | None) -> None:
         """Put without waiting, under the next number; an advanced publisher numbers only what its cache has."""
@@ -277,7 +314,7 @@ def note_feeder(zid: str) -> None:
     """A session puts answers to this process: it is a worker's, and none of those that receive outputs."""
     if zid in _feeders:
         return
-    if len(_feeders) >= MAX_FEEDERS:
+    if len(_feeders) >= MAX_KNOWN:
         _feeders.pop(next(iter(_feeders)))
     _feeders[zid] = None
 

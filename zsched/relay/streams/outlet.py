@@ -57,7 +57,8 @@ ROOM_SHARE: Final = 16
 ROOM_EVERY_S: Final = 0.1
 """...this often at most: all keys are looked at."""
 MAX_OWED: Final = 4096
-"""Samples that wait for the next owner after a crash (`OnCrash.REPLAY`); a queue has room for them besides its own."""
+"""Samples that wait for the next owner after a crash (`OnCrash.REPLAY`), or for an application that has stopped: a
+queue has room for them besides its own."""
 SKIP_EPOCH: Final = 0
 """Epoch of a marker that ends nothing: no number below its count will come any more."""
 
@@ -139,7 +140,7 @@ class Outlet:
             self._watch = self._probe.declare_matching_listener(seen)
         self._main = None if self._rewriting.is_wild else self._declare(to_expr, Priority.DATA, is_express=False)
         try:
-            self._queue = self._make_queue()
+            self._queue = self._make_queue(waits_long=has_crowd or self._replays)
         except RuntimeError:
             self._undeclare()
             raise
@@ -153,14 +154,14 @@ class Outlet:
         is_latest = self._settings.stream_class is StreamClass.LATEST
         return Crowd(self._session, self._to, lambda: queue.is_pressed, is_latest=is_latest)
 
-    def _make_queue(self) -> SendQueue | None:
+    def _make_queue(self, *, waits_long: bool) -> SendQueue | None:
         stream_class, depth = self._settings.stream_class, self._settings.depth
         if stream_class is StreamClass.BEST_EFFORT:
             return None
         is_reliable = stream_class is StreamClass.RELIABLE
         return SendQueue(
             f"to {self._to}",
-            depth=max(depth, QUEUE_DEPTH) + (MAX_OWED if self._replays else 0) if is_reliable else depth,
+            depth=max(depth, QUEUE_DEPTH) + (MAX_OWED if waits_long else 0) if is_reliable else depth,
             sheds=not is_reliable,
             keep_last=self._settings.keep_last,
             is_open=self._is_open if is_reliable and self._acks is not None else None,
@@ -327,6 +328,7 @@ class Outlet:
             return self.counted()
         left = self._queue.close(self._leave)
         if self._crowd is not None:
+            self._crowd.close()
             return Tally(waiting=left)
         with self._lock:
             said = self._sum()

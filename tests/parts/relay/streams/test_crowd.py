@@ -15,7 +15,7 @@ from support.sessions import hub_and_neighbour
 from support.waiting import free_endpoint, until
 from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.relay.streams import crowd
-from zsched.relay.streams.crowd import FITS_BYTES, MAX_REST_S, REST_S, Crowd, Reader, note_feeder
+from zsched.relay.streams.crowd import MAX_REST_S, REST_S, Crowd, Reader, note_feeder
 from zsched.relay.streams.given import Given
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outlet import Outlet
@@ -131,15 +131,6 @@ def test_who_is_left_again_soon_rests_longer(pair: Pair) -> None:
     assert reader.left_until == now + MAX_REST_S + REST_S
 
 
-def test_what_still_fits_into_a_full_link_is_not_missed(pair: Pair) -> None:
-    reader, _, _ = pair
-    missed = [reader.misses(10_000) for _ in range(20)]
-    assert missed.count(False) == FITS_BYTES // 10_048
-    assert missed == sorted(missed)
-    reader.look(NOW + 1, has_room=True)
-    assert not reader.misses(10_000)
-
-
 def test_the_sockets_of_all_links_are_found_and_workers_receive_no_outputs() -> None:
     endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
@@ -160,14 +151,12 @@ def test_the_sockets_of_all_links_are_found_and_workers_receive_no_outputs() -> 
 def test_what_readers_have_missed_is_told_once_also_to_one_who_asks_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[int] = []
 
-    class Full:
-        def misses(self, _size: int) -> bool:
-            told.append(made.take_missed())
-            return True
+    def drops(self: Crowd, *_: object) -> None:
+        told.append(self.take_missed())
 
     monkeypatch.setattr(Crowd, "_look", lambda *_args, **_named: False)
-    monkeypatch.setattr(Crowd, "_wait", lambda _: (Full(), Full()))
-    monkeypatch.setattr(Crowd, "_put_dropping", lambda *_args: None)
+    monkeypatch.setattr(Crowd, "_wait", lambda _: (None, None))
+    monkeypatch.setattr(Crowd, "_put_dropping", drops)
     with hub_and_neighbour() as (session, _):
         made = Crowd(session, "out", lambda: False, is_latest=False)
         for _ in range(3):
