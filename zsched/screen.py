@@ -10,7 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import Final, TextIO
+from typing import Any, Final, TextIO
 
 MIN_WIDTH: Final = 60
 """Of what is written for people; a terminal that is narrower breaks the lines itself."""
@@ -68,6 +68,17 @@ def _columns(stream: TextIO) -> int:
 def harmless(text: str) -> str:
     """The text with every character that a terminal would obey, but line ends and tabs, replaced by ``?``."""
     return text if text.isprintable() else "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+
+
+def printable(value: Any) -> Any:
+    """The JSON value with each of its texts as one such line."""
+    if isinstance(value, str):
+        return harmless(value).replace("\n", "?")
+    if isinstance(value, list):
+        return [printable(item) for item in value]
+    if isinstance(value, dict):
+        return {printable(key): printable(item) for key, item in value.items()}
+    return value
 
 
 def wrapped(text: str, width: int, indent: int = 2) -> str:

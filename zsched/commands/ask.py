@@ -24,6 +24,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
 from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.screen import printable
 
 if TYPE_CHECKING:
     from zsched.adapters.network.control_bus import Answer  # imports zenoh
@@ -55,6 +56,8 @@ READS = frozenset({"access", "explain", "fleet", "history", "lines", "log", "reh
 """Asked twice they change nothing."""
 ASK_TIMEOUT_S = 5.0
 """Above the daemon's own limits (3 s for its loop, 3 s for another node), so that their reasons arrive."""
+WHOLE = ("body", "sides", "text")
+"""What in an answer is a file and no words: a kept rehearsal, zenoh's settings, the fleet's document."""
 AGREED = frozenset({"change", "hold", "move", "tune"})
 """Orders whose end comes when the electors have agreed, or cannot."""
 ORDER_TIMEOUT_S = 62.0
@@ -307,7 +310,7 @@ def ask_door(door: Door, request: Json) -> Json:
     if door.node is not None:
         request = {**request, "node": door.node}
     try:
-        answer = _asked(door, request, ORDER_TIMEOUT_S if request["verb"] in AGREED else ASK_TIMEOUT_S)
+        answer = heard(_asked(door, request, ORDER_TIMEOUT_S if request["verb"] in AGREED else ASK_TIMEOUT_S))
     except AdapterError as error:
         raise _unanswered(door, error, is_order=request["verb"] not in READS) from error
     if "error" not in answer:
@@ -320,6 +323,11 @@ def ask_door(door: Door, request: Json) -> Json:
     runtime = door.socket.parent
     here = [path.stem for path in places.local_sockets(runtime)]
     raise CliError(EXIT_UNREACHABLE, _no_daemon(door.node, runtime, here, is_asked=True))
+
+
+def heard(answer: Json) -> Json:
+    """What a node has answered, with each word as one printable line: verbs hear others only by this, text and JSON."""
+    return {**printable(answer), **{name: answer[name] for name in WHOLE if name in answer}}
 
 
 def _asked(door: Door, request: Json, timeout_s: float) -> Json:
@@ -384,15 +392,15 @@ def _ask_elsewhere(door: Door, request: Json) -> Json:
         raise CliError(EXIT_FAILED, _guest_may_not(visit))
     try:
         if door.cell is not None:
-            return answer_json(_ask_cell(door.cell, door.node, command))
-        return answer_json(_client(door.endpoint).ask(door.node, command))
+            return heard(answer_json(_ask_cell(door.cell, door.node, command)))
+        return heard(answer_json(_client(door.endpoint).ask(door.node, command)))
     except AdapterError as error:
         is_unsure = isinstance(error.__cause__, TimeoutError)
         is_clear = door.cell is not None or (is_unsure and door.endpoint.startswith(PLAIN))  # it has told its status
         advice = "" if is_clear else _why_silent(door, visit, is_command=command is not None)
         if is_unsure and not advice:
             return answer_json(unknown(str(error)))
-        raise CliError(EXIT_UNREACHABLE, f"{error}{advice}") from error
+        raise CliError(EXIT_UNREACHABLE, printable(f"{error}{advice}")) from error
 
 
 def _why_silent(door: Door, visit: _Visit, *, is_command: bool) -> str:

@@ -25,7 +25,6 @@ from zsched.commands.report import (
     header,
     node_rows,
     per_second,
-    printable,
     told_hold,
     troubles,
 )
@@ -39,13 +38,13 @@ NO_TASK = "none yet; `zsched task add FILE` gives the fleet one"
 
 def render_brief(status: Json, width: int, color: bool, at: float | None = None) -> str:
     """The short form; arguments as of `zsched.commands.report.render_status`."""
-    page, shown = Page(width, color, at), printable(status)
-    header(page, shown)
-    node_rows(page, shown, "NODE")
-    flag_rows(page, shown)
-    task_rows(page, shown, at)
-    _pin_rows(page, shown)
-    troubles(page, shown)
+    page = Page(width, color, at)
+    header(page, status)
+    node_rows(page, status, "NODE")
+    flag_rows(page, status)
+    task_rows(page, status, at)
+    _pin_rows(page, status)
+    troubles(page, status)
     return "\n".join(page.lines) + "\n"
 
 

@@ -18,7 +18,7 @@ from typing import Final
 
 from zsched.adapters.host.decision_log import FILE_BYTES, NAME, NAMES
 from zsched.clock import wall_ns
-from zsched.commands.common import CliError, Json, print_json, say
+from zsched.commands.common import CliError, Json, harmless_json, print_json, say
 from zsched.commands.doctor import as_json, as_text
 from zsched.commands.page import size
 from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
@@ -30,6 +30,7 @@ from zsched.doctor.model import Result, Scene
 from zsched.doctor.table import run_all
 from zsched.exits import EXIT_FAILED, EXIT_OK
 from zsched.files import read_regular
+from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.bugreport/1"
 UNIT: Final = "zsched"
@@ -75,11 +76,11 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
     yield _json("versions.json", {**versions(), **machine})
     try:
         text = read_regular(scene.file, MAX_FILE_BYTES).decode("utf-8", errors="replace")
-        yield Member(name="fleet.yaml", content=clean_yaml(text, secrets).encode())
+        yield Member(name="fleet.yaml", content=harmless(clean_yaml(text, secrets)).encode())
     except OSError as error:
         yield Member(name="fleet.yaml", missing=f"{scene.file}: {error.strerror}")
     if scene.text:
-        yield Member(name="document.yaml", content=clean_yaml(scene.text, secrets).encode())
+        yield Member(name="document.yaml", content=harmless(clean_yaml(scene.text, secrets)).encode())
     results = [(check, _cleaned(result, secrets)) for check, result in run_all(scene)]  # before lines are broken
     yield Member(name="doctor.txt", content=as_text(results, TEXT_WIDTH, is_colored=False).encode())
     yield _json("doctor.json", as_json(scene, results))
@@ -92,7 +93,7 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
             yield Member(name=f"status/{name}.json", missing=f"{name} does not answer")
     yield from _decision_logs(scene.state_folder, secrets)
     try:
-        yield Member(name="journal.txt", content=clean((journal or _journal)(), secrets).encode())
+        yield Member(name="journal.txt", content=harmless(clean((journal or _journal)(), secrets)).encode())
     except OSError as error:
         yield Member(name="journal.txt", missing=str(error.strerror or error))
 
@@ -108,7 +109,7 @@ def _decision_logs(folder: Path, secrets: tuple[str, ...]) -> Iterator[Member]:
         except OSError as error:
             yield Member(name=name, missing=f"{folder / name}: {error.strerror}")
         else:
-            yield Member(name=name, content=clean(text, secrets).encode())
+            yield Member(name=name, content=harmless_json(clean(text, secrets)).encode())
 
 
 def _cleaned(result: Result, secrets: tuple[str, ...]) -> Result:
@@ -117,7 +118,7 @@ def _cleaned(result: Result, secrets: tuple[str, ...]) -> Result:
 
 
 def _json(name: str, body: Json) -> Member:
-    return Member(name=name, content=f"{json.dumps(body, ensure_ascii=False, indent=1)}\n".encode())
+    return Member(name=name, content=f"{harmless_json(json.dumps(body, ensure_ascii=False, indent=1))}\n".encode())
 
 
 def _journal() -> str:

@@ -21,7 +21,6 @@ from zsched.commands.report import degradations
 from zsched.core.values.fleet import Fleet
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_DEGRADED, EXIT_OK, EXIT_UNREACHABLE
-from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.site/1"
 ALIVE: Final = "alive"
@@ -136,7 +135,7 @@ def _print(fleet: Fleet, cells: list[Json]) -> None:
         told = cell["degraded"] if cell["error"] is None else [cell["error"]]
         lines += [f"  {cell['name']}: {text}" for text in told]
     lines += _alone(fleet)
-    sys.stdout.write("\n".join(harmless(line) for line in lines) + "\n")
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 def _row(cell: Json) -> tuple[str, str, str, str]:

@@ -220,12 +220,13 @@ def print_json(body: Mapping[str, Any], *, is_line: bool = False) -> None:
     """One JSON object on stdout: indented for people, or on one line (a stream of them is NDJSON)."""
     is_utf8 = (sys.stdout.encoding or "").lower().replace("-", "") in ("utf8", "")
     text = json.dumps(body, ensure_ascii=not is_utf8, indent=None if is_line else 2)
-    sys.stdout.write(f"{OBEYED.sub(_escaped, text)}\n")
+    sys.stdout.write(f"{harmless_json(text)}\n")
     sys.stdout.flush()
 
 
-def _escaped(found: re.Match[str]) -> str:
-    return rf"\u{ord(found[0]):04x}"
+def harmless_json(text: str) -> str:
+    """The JSON says the same, without what a terminal would obey."""
+    return OBEYED.sub(lambda found: rf"\u{ord(found[0]):04x}", text)
 
 
 def say(text: str, indent: int = 2) -> None:

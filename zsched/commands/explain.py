@@ -18,7 +18,6 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, warn
 from zsched.commands.history import age_s_of, is_known, is_move, wall_text, when_of, where_of
 from zsched.commands.page import Cell, Page, memory, name_room, short_name, span
-from zsched.commands.report import printable
 from zsched.commands.weight_words import shares
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import PAPER_METRICS, meant, shown
@@ -257,28 +256,27 @@ def _ask(door: Door, task: str) -> Json:
 
 def render(body: Json, width: int, color: bool) -> str:
     """An explanation for people, in ``width`` columns."""
-    shown = printable(body)
     page = Page(width, color)
-    when = f" ({shown['at']})" if shown["at"] else ""
-    head = f"task {shown['task']} · as {shown['node']} judged it {span(shown['age_s'])} ago{when}"
+    when = f" ({body['at']})" if body["at"] else ""
+    head = f"task {body['task']} · as {body['node']} judged it {span(body['age_s'])} ago{when}"
     page.row((head, width, "bold"))
     page.lines.append("")
-    _judgement(page, "DECISION", shown)
-    _made(page, shown)
-    _tuning(page, shown)
-    _robots(page, shown)
-    if shown["at"] is None:
-        _vote(page, shown)
+    _judgement(page, "DECISION", body)
+    _made(page, body)
+    _tuning(page, body)
+    _robots(page, body)
+    if body["at"] is None:
+        _vote(page, body)
     page.lines.append("")
-    if shown["robot"] is not None:
-        _seen(page, shown)
+    if body["robot"] is not None:
+        _seen(page, body)
     else:
-        _candidates(page, shown)
-        if shown["margin"] is not None:
-            page.block("MARGIN", (f"{shown['margin']:.4f} between the first two", ""))
-        _changes(page, shown)
-    if shown["plan"] is not None:
-        plan = shown["plan"]
+        _candidates(page, body)
+        if body["margin"] is not None:
+            page.block("MARGIN", (f"{body['margin']:.4f} between the first two", ""))
+        _changes(page, body)
+    if body["plan"] is not None:
+        plan = body["plan"]
         page.lines.append("")
         _judgement(page, f"WITHOUT {plan['without']}", plan)
         _candidates(page, plan)

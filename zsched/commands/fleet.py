@@ -23,6 +23,7 @@ from zsched.commands.flags import SEAT_ADVICE, without_seat
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.files import replace_regular
+from zsched.screen import harmless, is_screen
 
 SCHEMA = "zsched.fleet.show/1"
 
@@ -89,9 +90,7 @@ def export(door: Door, file: Path | None) -> int:
     held = in_force(door)
     text = document_text(held)
     if file is None:
-        sys.stdout.flush()
-        sys.stdout.buffer.write(text.encode())
-        sys.stdout.buffer.flush()
+        sys.stdout.buffer.write((harmless(text) if is_screen(sys.stdout) else text).encode())
         return EXIT_OK
     try:
         replace_regular(file, text.encode())

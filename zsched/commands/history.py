@@ -16,7 +16,7 @@ from typing import Final
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import Away, CliError, Json, nearest, print_json, say
 from zsched.commands.page import span
-from zsched.commands.report import millis, printable
+from zsched.commands.report import millis
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
@@ -165,9 +165,9 @@ def _check_names(door: Door, past: Past) -> None:
 
 def lines_of(told: Json, before: str = "") -> list[tuple[float, str]]:
     """(age, text behind ``before``) of all that a log has told."""
-    lines = [(move["age_s"], f"{before}{_move_line(printable(move))}") for move in told["moves"]]
+    lines = [(move["age_s"], f"{before}{_move_line(move)}") for move in told["moves"]]
     others = (*told["rehearsals"], *told["rollouts"], *told["changes"])
-    return [*lines, *((one["age_s"], f"{before}{_told_line(printable(one))}") for one in others)]
+    return [*lines, *((one["age_s"], f"{before}{_told_line(one)}") for one in others)]
 
 
 def print_lines(lines: Iterable[tuple[float, str]]) -> None:
@@ -332,9 +332,8 @@ def _print(entries: list[Json], view: EventsView) -> None:
         if view.is_json:
             print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
             continue
-        told = printable(entry)
-        where = f"task={told['task']} epoch={shown(told.get('epoch', 0))} " if told.get("task") else ""
-        say(f"{wall_text(entry['at'])} {told['stage']:<10} {where}{told['text']}", indent=4)
+        where = f"task={entry['task']} epoch={shown(entry.get('epoch', 0))} " if entry.get("task") else ""
+        say(f"{wall_text(entry['at'])} {entry['stage']:<10} {where}{entry['text']}", indent=4)
 
 
 def _is_of(entry: Json, types: Container[str]) -> bool:

@@ -20,7 +20,6 @@ from zsched.commands.common import Away, CliError, Json, nearest, print_json, wa
 from zsched.commands.page import clock_time
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
-from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.logs/1"
 PAUSE_S: Final = 0.5
@@ -203,5 +202,5 @@ def _print(view: LogsView, node: str, task: str, lines: list[Json]) -> None:
         if view.is_json:
             print_json({"schema": SCHEMA, "node": node, "task": task, **line}, is_line=True)
         else:
-            sys.stdout.write(harmless(f"{clock_time(now - line['age_s'], now)} {line['text']}") + "\n")
+            sys.stdout.write(f"{clock_time(now - line['age_s'], now)} {line['text']}\n")
     sys.stdout.flush()

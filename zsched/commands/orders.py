@@ -22,7 +22,6 @@ from zsched.core.values.model import MAX_FOR_S
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import MAX_ASKER, shown
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.screen import harmless
 
 PAUSE_S: Final = 0.2
 """Between two looks at what has become of an order."""
@@ -196,7 +195,7 @@ def show_rows(titles: Row, rows: Sequence[Row]) -> None:
     """Print a table, nothing if it has no row."""
     if not rows:
         return
-    shown = [titles, *[tuple(harmless(cell) for cell in row) for row in rows]]
+    shown = [titles, *rows]
     widths = [max(len(row[column]) for row in shown) for column in range(len(titles))]
     for row in shown:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]

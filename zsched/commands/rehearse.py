@@ -30,7 +30,7 @@ from zsched.core.values.rehearsal import FAULTS, MAX_CUT_S, Promised, Step
 from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import MAX_ASKED, meant, shown
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
-from zsched.screen import screen_width
+from zsched.screen import printable, screen_width
 from zsched.wire.codec import from_plain
 
 LOOK_S: Final = 0.2
@@ -105,7 +105,7 @@ def show_kept(door: Door, name: str | None, *, is_json: bool) -> int:
     names = [str(one) for one in told["names"]]
     if name is not None and not told["body"]:
         raise CliError(EXIT_USAGE, f"{told['node']} has kept no rehearsal {name!r}{nearest(name, names)}")
-    kept = json.loads(told["body"]) if name is not None else None
+    kept = printable(json.loads(told["body"])) if name is not None else None
     if is_json:
         print_json({"schema": SCHEMA, "node": told["node"], "names": names, "rehearsal": kept})
     elif kept is not None:

@@ -14,7 +14,7 @@ from zsched.commands.history import wall_text
 from zsched.commands.page import cut
 from zsched.core.rehearsal.programme import TELLS_S, Over, Result
 from zsched.core.values.rehearsal import Promised, Step
-from zsched.screen import harmless, wrapped
+from zsched.screen import wrapped
 
 SCHEMA: Final = "zsched.rehearse/1"
 COUNTS: Final = ("lost", "at most lost")
@@ -143,7 +143,7 @@ def table(body: Json, width: int | None) -> str:
     played = [row for row in body["rows"] if row["what"] != LEFT_OUT]
     lines = list(_lines([HEADS, *map(_cells, played)], width)) if played else []
     left_out = [f"{row['step']} left out: {row['where']}" for row in body["rows"] if row["what"] == LEFT_OUT]
-    told = [harmless(line) for line in (head, *lines, *left_out, str(body["way_back"]))]
+    told = [head, *lines, *left_out, str(body["way_back"])]
     return "\n".join(told if width is None else [wrapped(line, width) for line in told]) + "\n"
 
 

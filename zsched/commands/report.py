@@ -94,32 +94,21 @@ def render_status(status: Json, width: int, color: bool, at: float | None = None
 
     ``width`` in columns, from 60 (of more robots than fit, the table shows the first); ``color``: with ANSI colours.
     ``at``: when it was asked for (this machine's clock, seconds since 1970), for wall times beside ages; ``None``:
-    without. Text that came from other nodes cannot steer the terminal.
+    without.
     """
-    page, shown = Page(width, color, at), printable(status)
-    header(page, shown)
+    page = Page(width, color, at)
+    header(page, status)
     page.lines.append("")
-    node_rows(page, shown, "PROFILE")
-    flag_rows(page, shown)
-    _gauges(page, shown["nodes"])
-    _gateway(page, shown["nodes"])
-    _electors(page, shown["quorum"])
-    for task in shown["tasks"]:
+    node_rows(page, status, "PROFILE")
+    flag_rows(page, status)
+    _gauges(page, status["nodes"])
+    _gateway(page, status["nodes"])
+    _electors(page, status["quorum"])
+    for task in status["tasks"]:
         page.lines.append("")
-        _task(page, shown, task)
-    troubles(page, shown)
+        _task(page, status, task)
+    troubles(page, status)
     return "\n".join(page.lines) + "\n"
-
-
-def printable(value: Any) -> Any:
-    """The JSON value with every character that a terminal would obey replaced by ``?``."""
-    if isinstance(value, str):
-        return value if value.isprintable() else "".join(char if char.isprintable() else "?" for char in value)
-    if isinstance(value, list):
-        return [printable(item) for item in value]
-    if isinstance(value, dict):
-        return {printable(key): printable(item) for key, item in value.items()}
-    return value
 
 
 def header(page: Page, status: Json) -> None:

@@ -19,7 +19,7 @@ from zsched.core.route import keyexpr
 from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
-from zsched.screen import harmless
+from zsched.screen import printable
 
 if TYPE_CHECKING:
     from zsched.adapters.network.stream_tap import StreamTap, Tapped
@@ -136,7 +136,7 @@ def _table(node: str, streams: list[Json]) -> str:
         )
         if stream["from"]:
             page.lines.append(f"  {stream['from']} -> {stream['to']}")
-    return harmless("\n".join(page.lines)) + "\n"
+    return "\n".join(page.lines) + "\n"
 
 
 def _number(value: float | None) -> str:
@@ -264,7 +264,7 @@ def _print_rates(
     if not rows:
         say(f"nothing in {view.window_s:g} s")
     for (side, key), row in rows.items():
-        where = f"{key} ({side} side)" if side != "fleet" else key
+        where = printable(f"{key} ({side} side)" if side != "fleet" else key)
         say(f"{where}: {_hz_text(row) if verb == 'hz' else _bw_text(row)}")
     if told:
         say(f"... {told}")
@@ -324,7 +324,7 @@ def _print_sample(view: StreamView, sample: Tapped) -> None:
     kind = "" if sample.kind == "put" else f" {sample.kind}"
     side = "" if sample.side == "fleet" else f" ({sample.side} side)"
     more = "…" if sample.size > PREVIEW else ""
-    say(f"{sample.key}{side}{kind} {size(sample.size)} {sample.encoding} {_shown(head)}{more}")
+    say(printable(f"{sample.key}{side}{kind} {size(sample.size)} {sample.encoding} {_shown(head)}{more}"))
 
 
 def _shown(head: bytes) -> str:

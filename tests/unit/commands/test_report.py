@@ -17,7 +17,7 @@ import pytest
 
 from support.fleets import tuning_of
 from zsched.commands.page import Page, cut, memory, size, span
-from zsched.commands.report import all_problems, degradations, printable, render_status
+from zsched.commands.report import all_problems, degradations, render_status
 from zsched.core.report import snapshot_json
 from zsched.core.values.model import Utility
 from zsched.core.values.plan import StreamCount
@@ -169,16 +169,6 @@ def test_colour_changes_nothing_but_colour(name: str) -> None:
     assert "\x1b[" in coloured
     assert "\x1b" not in plain
     assert re.sub(r"\x1b\[[0-9;]*m", "", coloured) == plain
-
-
-def test_text_of_another_node_cannot_steer_the_terminal() -> None:
-    status = recorded("healthy")
-    status["tasks"][0]["decision"]["reason"] = "\x1b]0;owned\x07\x1b[2Jnice\r\nPROBLEMS none\u202e"
-    status["tasks"][0]["decision"]["vetoed"] = {"\x1b[31medge2": "\u009b31m"}
-    text = render_status(status, 80, color=False)
-    assert not [char for char in text if not char.isprintable() and char != "\n"]
-    assert "?]0;owned??[2Jnice??PROBLEMS none?" in text.replace("\n", " ")
-    assert printable({"a\x00": ["\x7f", 1, None]}) == {"a?": ["?", 1, None]}
 
 
 def test_more_robots_than_fit_are_counted() -> None:

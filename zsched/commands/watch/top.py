@@ -15,10 +15,9 @@ from typing import Final
 from zsched.commands.brief import task_rows
 from zsched.commands.common import Json
 from zsched.commands.page import Cell, Page, clock_time, missed_of, name_room, short_name, size, span
-from zsched.commands.report import header, millis, node_rows, per_second, printable, troubles
+from zsched.commands.report import header, millis, node_rows, per_second, troubles
 from zsched.commands.watch.past import Past, Point
 from zsched.core.values.struct import Struct
-from zsched.screen import harmless
 
 LEVELS: Final = "▁▂▃▄▅▆▇█"
 TOP: Final = 1.0
@@ -61,24 +60,20 @@ class Frame(Struct, frozen=True, kw_only=True):
 
 
 def render_top(past: Past, frame: Frame) -> list[str]:
-    """The lines of one screen: at most ``frame.height``, none wider than ``frame.width``.
-
-    Text that came from other nodes cannot steer the terminal.
-    """
+    """The lines of one screen: at most ``frame.height``, none wider than ``frame.width``."""
     if frame.width < MIN_WIDTH or frame.height < MIN_HEIGHT:
         told = f"this window has {frame.width} columns and {frame.height} lines: {MIN_WIDTH} and {MIN_HEIGHT} at least"
         return [*textwrap.wrap(told, frame.width), "q ends"[: frame.width]][: frame.height]
     status = past.status
     if status is None:
-        return [harmless(past.why)[: frame.width], "asking again; q ends"][: frame.height]
-    shown = printable(status)
-    head = _head(shown, frame)
-    tail = _problems(shown, frame)
-    foot = [_foot(past, shown, frame)] if frame.is_live or past.why else []
+        return [past.why[: frame.width], "asking again; q ends"][: frame.height]
+    head = _head(status, frame)
+    tail = _problems(status, frame)
+    foot = [_foot(past, status, frame)] if frame.is_live or past.why else []
     moves = _moves(past, frame)
     room = frame.height - len(head) - len(tail) - len(foot)
     least = min(len(moves), LEAST_MOVES + 1)
-    body = _tasks(past, shown, frame, max(room - least, 1))
+    body = _tasks(past, status, frame, max(room - least, 1))
     left = max(room - len(body), 0)
     whole = _moves(past, frame, is_whole=True)
     moves = whole if len(whole) <= left else moves
@@ -116,7 +111,7 @@ def _problems(status: Json, frame: Frame) -> list[str]:
 def _foot(past: Past, status: Json, frame: Frame) -> str:
     page = _page(frame)
     if past.why:
-        gone = f"no answer since {clock_time(past.answered_at, frame.now)}: {harmless(past.why)}"
+        gone = f"no answer since {clock_time(past.answered_at, frame.now)}: {past.why}"
         page.row((gone, frame.width, "alarm"))
         return page.lines[0]
     keys = "q ends · arrows scroll tasks" if len(status["tasks"]) > 1 else "q ends"
@@ -244,7 +239,7 @@ def _streams(task: Json, frame: Frame) -> list[str]:
 def _moves(past: Past, frame: Frame, *, is_whole: bool = False) -> list[str]:
     """A title and a line per move, the newest first; ``is_whole``: more lines where its reason needs them."""
     page = _page(frame)
-    moves = printable([move for move in past.moves() if not move["is_known"]])
+    moves = [move for move in past.moves() if not move["is_known"]]
     if not moves:
         return []
     page.row(("MOVES", frame.width, "stage"))
