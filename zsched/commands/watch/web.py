@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import http.server
+import io
 import ipaddress
 import json
 import os
@@ -43,6 +44,8 @@ SEND_S: Final = 10.0
 PING_S: Final = 15.0
 """A live connection says something at least this often, so that one whose other end is gone is noticed."""
 MOST_TOKEN_BYTES: Final = 4096
+MOST_HEAD_BYTES: Final = 16384
+"""Of a request: its line and all headers, among them what a proxy adds."""
 
 
 class WebView(Struct, frozen=True, kw_only=True):
@@ -258,10 +261,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def handle(self) -> None:
         """Answer one request, and end."""
         self.close_connection = True
-        self.raw_requestline = self.rfile.readline(65537)
-        if len(self.raw_requestline) > 65536:
+        head = self._read_head()
+        self.rfile = io.BytesIO(head)  # the library reads lines of 64 KiB, a hundred of them
+        self.raw_requestline = self.rfile.readline()
+        if len(head) > MOST_HEAD_BYTES:
             self.requestline = self.request_version = self.command = ""
-            self._refuse(Refusal(status=414, why="the address is too long"))
+            self._refuse(Refusal(status=431, why=f"a request's head has at most {MOST_HEAD_BYTES} bytes"))
             return
         if not self.raw_requestline or not self.parse_request():
             return
@@ -275,6 +280,14 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._live()
         else:
             self._answer(route)
+
+    def _read_head(self) -> bytes:
+        """All up to the empty line, or one byte more than may be."""
+        head = line = self.rfile.readline(MOST_HEAD_BYTES + 1)
+        while line.strip() and len(head) <= MOST_HEAD_BYTES:
+            line = self.rfile.readline(MOST_HEAD_BYTES + 1 - len(head))
+            head += line
+        return head
 
     def _answer(self, route: Route) -> None:
         hub = self.server.hub

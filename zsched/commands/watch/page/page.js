@@ -5,7 +5,8 @@ const KEPT_S = 900;
 const LONGEST_S = 3600;
 const MOST_EVENTS = 200;
 const SILENT_MS = 20000;  // the server pings every 15 s
-const state = { now: null, points: {}, moves: [], events: [], explained: {}, open: new Set(), token: "", isCut: false };
+const state = { now: null, points: new Map(), moves: [], events: [], explained: new Map(), open: new Set(), token: "", isCut: false };
+const byName = (object) => new Map(Object.entries(object));  // by name: an object has a "constructor" of its own
 const byId = (id) => document.getElementById(id);
 
 // --- elements --------------------------------------------------------------------------------------------------------
@@ -70,14 +71,14 @@ function topology(status) {
   const wide = Math.min(Math.round(room * 0.36), 190), gap = room - 2 * wide, isNarrow = wide < 150;
   const rows = Math.max(sides[0].length, sides[1].length, 1);
   const width = room, height = rows * step + 4;
-  const places = {};
+  const places = new Map();
   sides.forEach((side, column) => side.forEach((node, row) => {
-    places[node.name] = { x: column * (wide + gap), y: (row + (rows - side.length) / 2) * step + 4, column };
+    places.set(node.name, { x: column * (wide + gap), y: (row + (rows - side.length) / 2) * step + 4, column });
   }));
   const wires = [], labels = [], boxes = [];
   const robots = sides[0].map((one) => one.name);
   for (const node of status.nodes) for (const link of node.links) {
-    const [from, to] = [places[node.name], places[link.peer]];
+    const [from, to] = [places.get(node.name), places.get(link.peer)];
     if (!to || link.rssi_dbm === null) continue;
     const isAcross = from.column !== to.column;
     const start = [from.x + (from.column ? 0 : wide), from.y + high / 2];
@@ -89,7 +90,7 @@ function topology(status) {
       s("text", { class: "small", x, y: y + 3, "text-anchor": "middle" }, link.rssi_dbm.toFixed(0)));
   }
   for (const node of status.nodes) {
-    const { x, y } = places[node.name];
+    const { x, y } = places.get(node.name);
     const owned = status.tasks.filter((task) => task.owner === node.name).map((task) => task.name);
     const common = node.links.find((link) => link.peer === null);
     const way = !common ? "" : common.rssi_dbm === null ? common.source : `${common.rssi_dbm.toFixed(0)}${isNarrow ? "" : " dBm"}`;
@@ -113,7 +114,7 @@ function topology(status) {
 
 function window_() {
   const to = Math.max(state.now.answered_at, 1);
-  const first = Math.min(...Object.values(state.points).map((points) => (points.length ? points[0].at : to)), to - 60);
+  const first = Math.min(...[...state.points.values()].map((points) => (points.length ? points[0].at : to)), to - 60);
   return { from: Math.max(first, to - KEPT_S), to };
 }
 function longer(view) {
@@ -123,7 +124,7 @@ function longer(view) {
 const across = (at, view, width) => ((at - view.from) / (view.to - view.from)) * width;
 
 function chart(task, view) {
-  const width = roomOf("tasks", 280, 2000), left = 22, height = 120, points = (state.points[task.name] || []).filter((point) => point.at >= view.from);
+  const width = roomOf("tasks", 280, 2000), left = 22, height = 120, points = (state.points.get(task.name) || []).filter((point) => point.at >= view.from);
   const y = (value) => height - 6 - Math.min(Math.max(value, 0), 1.1) / 1.1 * (height - 12);
   const at = (when) => left + across(when, view, width - left);
   const parts = [0, 0.5, 1].map((value) => [s("line", { class: "grid", x1: left, x2: width, y1: y(value), y2: y(value) }),
@@ -135,7 +136,7 @@ function chart(task, view) {
   for (const name of task.candidates) {
     let path = "", isDown = false;
     for (const point of points) {
-      const value = point.totals[name];
+      const value = point.totals.get(name);
       if (value === undefined) { isDown = false; continue; }
       path += `${isDown ? "L" : "M"}${at(point.at).toFixed(1)} ${y(value).toFixed(1)}`;
       isDown = true;
@@ -147,11 +148,11 @@ function chart(task, view) {
 }
 
 function taskCard(task, view) {
-  const points = state.points[task.name] || [], newest = points.length ? points[points.length - 1].totals : {};
-  const vetoed = task.decision ? task.decision.vetoed : {};
+  const points = state.points.get(task.name) || [], newest = points.length ? points[points.length - 1].totals : new Map();
+  const vetoed = byName(task.decision ? task.decision.vetoed : {});
   const legend = task.candidates.map((name) => h("span", {},
     s("svg", { viewBox: "0 0 10 10" }, s("rect", { class: `f${colour(name)}`, width: 10, height: 10, rx: 2 })),
-    `${name}${name === task.owner ? " *" : ""} `, newest[name] === undefined ? h("span", { class: "dim" }, vetoed[name] || "-") : newest[name].toFixed(3)));
+    `${name}${name === task.owner ? " *" : ""} `, newest.has(name) ? newest.get(name).toFixed(3) : h("span", { class: "dim" }, vetoed.get(name) || "-")));
   const isFine = task.owner !== null && task.owner_state === "alive";
   const isOpen = state.open.has(task.name);
   return h("div", { class: "task" },
@@ -161,7 +162,7 @@ function taskCard(task, view) {
       h("button", { type: "button", click: () => toggle(task.name), "aria-expanded": String(isOpen) }, isOpen ? "close" : "explain")),
     points.length ? chart(task, view) : h("p", { class: "dim" }, "no judgement here: edges decide nothing, so ask a robot (--node)"),
     h("div", { class: "legend" }, legend),
-    isOpen ? explained(state.explained[task.name]) : null);
+    isOpen ? explained(state.explained.get(task.name)) : null);
 }
 
 function explained(body) {
@@ -189,9 +190,9 @@ async function toggle(task) {
 async function explain(task) {
   try {
     const answer = await fetch(`/api/explain/${encodeURIComponent(task)}`, { headers: bearer() });
-    state.explained[task] = await answer.json();
+    state.explained.set(task, await answer.json());
   } catch (error) {
-    state.explained[task] = { error: String(error) };
+    state.explained.set(task, { error: String(error) });
   }
   if (state.now) draw();
 }
@@ -280,7 +281,8 @@ function draw() {
 
 const takers = {
   past(body) {
-    state.points = body.points;
+    state.points = byName(body.points);
+    for (const points of state.points.values()) for (const point of points) point.totals = byName(point.totals);
     state.moves = body.moves;
     state.events = body.events.slice(-MOST_EVENTS);
   },
@@ -288,7 +290,9 @@ const takers = {
     state.now = body;
     state.isCut = false;
     for (const [task, point] of Object.entries(body.points)) {
-      const kept = (state.points[task] = state.points[task] || []);
+      point.totals = byName(point.totals);
+      const kept = state.points.get(task) || [];
+      state.points.set(task, kept);
       if (kept.length && kept[kept.length - 1].at - point.at > 0.1) kept.length = 0; // the clock there was set back
       if (!kept.length || point.at > kept[kept.length - 1].at + 0.1) kept.push(point);
       while (kept.length > KEPT_S) kept.shift();
@@ -349,7 +353,7 @@ async function hear(signal, heard) {
     text = blocks.pop();
     for (const block of blocks) {
       const [, kind, data] = /^event: (\w+)\ndata: (.*)$/.exec(block) || [];
-      if (kind in takers) takers[kind](JSON.parse(data));
+      if (Object.hasOwn(takers, kind)) takers[kind](JSON.parse(data));
     }
   }
 }
