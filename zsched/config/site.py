@@ -10,7 +10,7 @@ from pathlib import Path
 from zsched.config.blocks import Located, Section
 from zsched.config.nodes import warn_missing
 from zsched.config.reader import Collector
-from zsched.config.security import ENCRYPTED
+from zsched.config.security import TLS
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Cell
 
@@ -33,7 +33,7 @@ def read_site(section: Section, folder: Path, out: Collector) -> tuple[Cell, ...
         file = one.value.get("file", "")
         if file:
             warn_missing(folder / file, one.value.where("file"), out)
-        elif any(gateway.value.startswith(ENCRYPTED) for gateway in gateways):
+        elif any(gateway.value.startswith(TLS) for gateway in gateways):
             message = f"{name!r} is a secured fleet, and nothing says with which certificate it is asked"
             hint = "file: its fleet file, whose `security: {folder:}` holds a certificate of its authority"
             out.error(gateways[0].place, message, hint)

@@ -280,7 +280,7 @@ def secured(*, certificate: str, key: str, trusted: str, rules: Settings, operat
         ValueError: the operator's JSON5 is not a zenoh configuration.
     """
     settings: Settings = {
-        "transport/link/protocols": ["tls", "quic"],
+        "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": trusted,
             "enable_mtls": True,

@@ -8,7 +8,7 @@ from zsched.core.values.fleet import Security, fleet_hash
 TEXT = """\
 fleet: yard
 nodes:
-  robot1: {kind: robot, host: 192.0.2.1, listen: {control: tls/0.0.0.0:7457, data: quic/0.0.0.0:7458}}
+  robot1: {kind: robot, host: 192.0.2.1, listen: {control: tls/0.0.0.0:7457, data: tls/0.0.0.0:7458}}
   robot2: {kind: robot}
 security:
 """
@@ -104,3 +104,11 @@ def test_plain_text_beside_the_section_is_a_fault_with_the_line_to_write() -> No
     (fault,) = result.faults
     assert fault.message == "tcp/ is plain text, and the fleet is secured (line 5)"
     assert fault.hint == "tls/0.0.0.0:7457"
+
+
+def test_quic_is_refused_for_its_links_do_not_end_when_they_are_refused() -> None:
+    text = TEXT.replace("data: tls/", "data: quic/")
+    (fault,) = check("{}", text).faults
+    assert fault.message == "zenoh cannot end a refused link of quic/, and the fleet is secured (line 5)"
+    assert fault.hint == "tls/0.0.0.0:7458"
+    assert check_bytes(text.replace("security:", "").encode()).fleet is not None

@@ -38,7 +38,7 @@ def test_the_text_has_tls_both_ways_and_denies_what_no_rule_allows(pki: Path) ->
     assert tls["close_link_on_expiration"]
     assert (tls["listen_private_key"], tls["root_ca_certificate"]) == (str(pki / "key.pem"), str(pki / "ca.pem"))
     assert json.loads(config.get_json("access_control"))["default_permission"] == "deny"
-    assert json.loads(config.get_json("transport/link/protocols")) == ["tls", "quic"]
+    assert json.loads(config.get_json("transport/link/protocols")) == ["tls"]
     assert protocol_of(yard, "") == "tls"
     assert session_text(replace(yard, security=None), Side.CONTROL) == ""
 
