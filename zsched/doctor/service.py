@@ -201,7 +201,12 @@ def _file(scene: Scene, path: Path, *, hides_homes: bool, reader: _Reader) -> It
     elif hides_homes and (hidden := _home_of(path)):
         yield failed(f"{path} is below {hidden}, which the service cannot see (ProtectHome)", fix="move it to /etc")
     elif not reader.reads(here.stat()):
-        yield failed(f"{path} is not readable by the service's user", fix=f"sudo chmod o+r {path}")
+        fix = (
+            f"sudo chgrp {reader.group} {path} && sudo chmod 640 {path}"
+            if reader.group > 0
+            else f"sudo chmod o+r {path}"
+        )
+        yield failed(f"{path} is not readable by the service's user", fix=fix)
 
 
 def _home_of(path: Path) -> str:

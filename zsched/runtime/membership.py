@@ -63,7 +63,9 @@ OUT_NAME: Final = "out"
 """In the state folder, from before the daemon ends for good until its files are put away: see `note_out`."""
 LOGS: Final = decision_log.NAMES
 """They go with the fleet of which they tell: tasks and epochs of the next one may have the same names and numbers."""
-PUBLIC_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o600, 0o755
+PUBLIC_MODE, GROUP_MODE, PRIVATE_MODE, FOLDER_MODE = 0o644, 0o640, 0o600, 0o755
+SERVICE: Final = "zsched"
+"""The group that `zsched install` and the package make for the service."""
 _WHAT: Final = {
     CERTIFICATE: "the certificate",
     TRUSTED: "whom it trusts",
@@ -782,9 +784,29 @@ def _listed_file(places: Places, text: bytes) -> tuple[Written, ...]:
 def _put_file(places: Places, text: bytes) -> None:
     """Write the fleet file; another one that is there is kept beside it."""
     old, former = _other_text(places.config, text), _former(places.config)
+    if former is None:
+        with _told_of(places.config):
+            _make_folder(places.config.parent)
+            put_whole(places.config, text, *_for_the_service())
+            sync_folder(places.config.parent)
+        return
     if old is not None:
-        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PUBLIC_MODE, former)
-    _put(places.config, text, PUBLIC_MODE, former)
+        _put(places.config.with_name(f"{places.config.name}{BEFORE}"), old, PRIVATE_MODE, former)
+    _put(places.config, text, PRIVATE_MODE, former)
+
+
+def _for_the_service() -> tuple[int, Callable[[int], None]]:
+    """(mode, who hands it over) of a new fleet file: its owner and the service's group may read workers' secrets.
+
+    Everybody may where root writes it and there is no such group: a user that systemd makes is in none that has a name.
+    """
+    import grp  # noqa: PLC0415 - only who writes the file pays for it
+
+    try:
+        group = grp.getgrnam(SERVICE).gr_gid if os.geteuid() == 0 else -1
+    except KeyError:
+        return PUBLIC_MODE, lambda _descriptor: None
+    return GROUP_MODE, lambda descriptor: os.fchown(descriptor, -1, group)
 
 
 def _put_all(

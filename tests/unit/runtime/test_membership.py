@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import grp
 import os
 import shutil
 import stat
@@ -262,6 +263,18 @@ def test_a_file_that_only_some_may_read_stays_so_and_so_does_the_copy_of_the_for
         assert (stat.S_IMODE(found_.st_mode), found_.st_uid, found_.st_gid) == (0o640, *owner)
 
 
+@pytest.mark.parametrize(("service", "mode"), [("daemon", 0o640), ("no-such-group", 0o644)])
+def test_a_new_file_is_for_its_owner_and_the_service_s_group(
+    service: str, mode: int, second: Places, invitation: Invitation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The service's user must read it, and has no name where the unit came alone."""
+    monkeypatch.setattr(membership, "SERVICE", service)
+    join(invitation, second, is_plan=False)
+    found_, is_root = second.config.stat(), os.geteuid() == 0
+    assert stat.S_IMODE(found_.st_mode) == (mode if is_root else 0o640)
+    assert grp.getgrgid(found_.st_gid).gr_name == service or mode == 0o644 or not is_root
+
+
 def test_a_state_of_another_node_fleet_or_generation_is_left_as_it_is(
     first: Places, second: Places, invitation: Invitation
 ) -> None:
@@ -393,9 +406,8 @@ def test_a_fleet_that_was_founded_in_part_is_founded_again(first: Places) -> Non
     assert value_at(first, "robot1")[1].text == TEXT
 
 
-@pytest.mark.parametrize("place", ["config", "copy"])
-def test_what_is_in_the_way_of_a_file_is_named(second: Places, invitation: Invitation, place: str) -> None:
-    file = second.config if place == "config" else second.state / "copied"
+def test_what_is_in_the_way_of_a_file_is_named(second: Places, invitation: Invitation) -> None:
+    file = second.state / "copied"
     (file.parent / f"{file.name}.new").mkdir(parents=True)
     with pytest.raises(AdapterError, match=rf"cannot write .*/{file.name}: Is a directory; look what is at"):
         join(invitation, second, is_plan=False)

@@ -38,7 +38,7 @@ def ask(path: Path, request: Json, timeout_s: float = 5.0) -> Json:
     except (BlockingIOError, TimeoutError) as error:  # the first: its queue of connections is full
         what = f"the daemon at {path} did not answer within {timeout_s:g} s; is it wedged?"
         raise AdapterError(f"{what} If it stays so: sudo systemctl restart zsched (its relay goes on)") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         detail = getattr(error, "strerror", None) or error
         raise AdapterError(f"no daemon answers at {path} ({detail}); start it with `zsched up`") from error
     if not isinstance(answer, dict):

@@ -25,6 +25,7 @@ MAX_LINE = 1 << 20
 MAX_CONNECTIONS = 16
 IDLE_S = 10.0
 """A connection that says nothing for this long, or does not take its answer, is closed..."""
+NESTED = "a request is an object of words and numbers: this one is nested too deeply"
 RETRY_S = 0.2
 """Pause after a connection that could not be taken (no descriptors, no memory, no thread)."""
 
@@ -155,22 +156,30 @@ class OperatorSocket:
                     if not line.endswith(b"\n"):  # half a request, or longer than any: not ours to guess at
                         connection.sendall(b'{"error": "expected one line of less than 1 MiB"}\n')
                         return
-                    connection.sendall(json.dumps(self._respond(line)).encode() + b"\n")
+                    connection.sendall(self._respond(line).encode() + b"\n")
                     self._mark(connection, is_busy=False)
         except OSError:
             pass  # the operator went away
         finally:
             self._forget(connection)
 
-    def _respond(self, line: bytes) -> Json:
+    def _respond(self, line: bytes) -> str:
+        try:
+            return json.dumps(self._answered(line))
+        except RecursionError:
+            return json.dumps({"error": NESTED})
+
+    def _answered(self, line: bytes) -> Json:
         try:
             request = json.loads(line)
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             return {"error": f"not a JSON object on one line: {error}"}
         if not isinstance(request, dict) or not isinstance(request.get("verb"), str):
             return {"error": "expected an object with a verb"}
         try:
             return self._answer(request)
+        except RecursionError:
+            raise
         except Exception as error:
             log.exception("request_failed verb=%s", request["verb"])
             return {"error": f"{type(error).__name__}: {error}"}

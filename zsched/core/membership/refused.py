@@ -47,8 +47,15 @@ def _told(label: str, fleet: Fleet) -> str:
         Role.GUEST: set(security.guests),
     }
     if name in names[holder.role]:
-        if holder in accepted(name, holder.role, security.revoked):
+        let_in = accepted(name, holder.role, security.revoked)
+        if holder in let_in:
             return ""  # the sessions let it in once they have begun anew
+        if holder.key > let_in[-1].key:
+            return (
+                f"{label} dials with a key that nobody has issued for this fleet as it is: it lets in "
+                f"{let_in[-1].label}. "
+                f"If `zsched pki show` has {label}, write the keys before it below `revoked:` (`zsched edit`)"
+            )
         way = f"`zsched invite {name}` here and `zsched join` there"
         way = way if holder.role is Role.NODE else f"`zsched pki issue {name} --role {holder.role}`"
         return (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import os
 import resource
@@ -27,7 +28,7 @@ Json = dict[str, Any]
 def echo(request: Json) -> Json:
     if request["verb"] == "raise":
         raise RuntimeError("a bug")
-    return {"heard": request}
+    return {"heard": copy.deepcopy(request)}
 
 
 @pytest.fixture
@@ -77,13 +78,17 @@ def test_one_connection_asks_as_often_as_it_likes(door: OperatorSocket) -> None:
         (b"\n", "not a JSON object on one line"),
         (b"not json\n", "not a JSON object on one line"),
         (b"\xff\xfe\x00\x01\n", "not a JSON object on one line"),
-        (b"[" * 200_000 + b"\n", "not a JSON object on one line"),
+        (b"[" * 200_000 + b"\n", "nested too deeply"),
+        *(
+            (b'{"verb": "status", "node": ' + b"[" * deep + b"]" * deep + b"}\n", "nested too deeply")
+            for deep in (950, 9000)
+        ),
         (b"[1, 2]\n", "expected an object with a verb"),
         (b"{}\n", "expected an object with a verb"),
         (b'{"verb": 5}\n', "expected an object with a verb"),
         (b'{"verb": "raise"}\n', "RuntimeError: a bug"),
     ],
-    ids=["empty", "text", "binary", "deep", "list", "no verb", "verb 5", "bug"],
+    ids=["empty", "text", "binary", "deep", "as deep as is read", "deeper", "list", "no verb", "verb 5", "bug"],
 )
 def test_bad_line_is_an_error_and_the_connection_lives(door: OperatorSocket, line: bytes, says: str) -> None:
     with connected(door) as connection:

@@ -36,6 +36,14 @@ def test_a_revoked_key_is_named_with_the_way_to_another_one() -> None:
     assert "`zsched pki issue ana --role operator`" in line
 
 
+def test_a_key_that_was_never_issued_is_not_called_revoked() -> None:
+    (line,) = told("robot1.k3")
+    assert line.startswith(
+        "robot1.k3 dials with a key that nobody has issued for this fleet as it is: it lets in robot1. "
+    )
+    assert "revoked, and" not in line
+
+
 def test_who_is_not_in_the_document_is_named_with_both_ways() -> None:
     (line,) = told("robot3.k2")
     assert "which has no node robot3, and is not let in: `zsched leave` on that machine" in line
