@@ -91,8 +91,8 @@ def run(words: str, *more: str) -> Result:
         *("status", "status --verbose", "top --once", "explain echo", "events", "history", "stream list --window 0.1"),
         *("logs echo", "metrics print", "fleet show", "rehearse --list", "rehearse --show r1", "fleet export"),
         *("move echo edge2 --yes", "drain edge1 --yes", "drain", "pin echo edge1 --yes", "pin", "pause echo --yes"),
-        *("tune echo bonus=0.2 --yes"),
-        *("restart echo edge1 --yes"),
+        "tune echo bonus=0.2 --yes",
+        "restart echo edge1 --yes",
     ],
 )
 def test_no_verb_lets_the_words_of_others_out_of_their_line(words: str) -> None:
