@@ -10,7 +10,6 @@ import errno
 import ipaddress
 import os
 import shlex
-import socket
 import stat
 import sys
 from collections.abc import Sequence
@@ -56,6 +55,7 @@ from zsched.runtime.membership import (
 )
 from zsched.runtime.membership import join as join_here
 from zsched.runtime.own_addresses import addresses_at
+from zsched.runtime.roaming import ANY_HOST, addresses_towards
 from zsched.runtime.unfinished import unfinished
 from zsched.wire.codec import from_plain
 from zsched.wire.invitation import MAX_BYTES, Invitation, decode_invitation, encode_invitation
@@ -160,8 +160,8 @@ def own_address(root: Path = Path("/")) -> str:
     Raises:
         CliError: it has none, or several.
     """
-    if routed := _routed_address():
-        return routed
+    if routed := addresses_towards((ANY_HOST,)):
+        return routed[0]
     everywhere = "0.0.0.0"  # noqa: S104 - nothing listens
     found = [one for one in addresses_at(root, everywhere) if not one.is_loopback and not one.is_link_local]
     if not found:
@@ -170,16 +170,6 @@ def own_address(root: Path = Path("/")) -> str:
         here = ", ".join(map(str, found))
         raise CliError(EXIT_FAILED, f"which of its addresses do others dial? Give one with --address (here: {here})")
     return str(found[0])
-
-
-def _routed_address() -> str:
-    """From which packets for other networks would leave; empty: there is no default route."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # of documentation, and nothing is sent: the kernel only looks for the way
-        except OSError:
-            return ""
-        return str(probe.getsockname()[0])
 
 
 def _entry_of(name: str, kind: NodeKind, address: Address | None, protocol: str) -> str:

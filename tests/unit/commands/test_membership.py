@@ -177,7 +177,7 @@ def test_who_dials_whom_is_kept_when_it_is_written_down() -> None:
 
 
 def test_a_fleet_of_one_is_created_with_this_machines_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(membership, "_routed_address", lambda: "192.0.2.9")
+    monkeypatch.setattr(membership, "addresses_towards", lambda _: ("192.0.2.9",))
     result = run("fleet", "create", "hall", "--node", "robot1", *here(tmp_path))
     assert result.exit_code == 0, result.stderr
     fleet = load_fleet(tmp_path / "fleet.yaml")
@@ -204,7 +204,7 @@ def test_without_a_default_route_the_only_address_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, addresses: tuple[str, ...], said: str
 ) -> None:
     """A hall whose Wi-Fi leads nowhere else."""
-    monkeypatch.setattr(membership, "_routed_address", lambda: "")
+    monkeypatch.setattr(membership, "addresses_towards", lambda _: ())
     table = tmp_path / "proc" / "net" / "fib_trie"
     table.parent.mkdir(parents=True)
     table.write_text("Main:\n" + "".join(f"  |-- {one}\n     /32 host LOCAL\n" for one in addresses))
