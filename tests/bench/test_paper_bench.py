@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.netns import why_not
 from zsched_lab.fleet.recorder import read_records
 from zsched_lab.maps.laser_log import malaga_path

@@ -15,7 +15,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from support.waiting import until
-from zsched.adapters.machine.cgroup import LimitedGroup
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.janitor import TOKEN_VARIABLE
 from zsched_lab.paper.places import scenario_path
 

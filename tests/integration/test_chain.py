@@ -20,12 +20,12 @@ import zenoh
 
 from support.waiting import within
 from zsched.adapters.host.operator_client import ask
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.core.values.model import Proposal
 from zsched.paths import socket_path
 from zsched.sessions import config as zenoh_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.testbed import DAEMON, Testbed, echo_fleet
 
 STOP_S = 4.0

@@ -9,13 +9,13 @@ import sys
 import pytest
 
 from support.waiting import until
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.adapters.relay import streams
 from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport
 from zsched.errors import AdapterError
 from zsched.sessions.config import data_config
+from zsched_lab.fleet.groups import LimitedGroup
 
 pytestmark = pytest.mark.long
 

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.chaos import GUARD, ChaosBed
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.netbed import DATA_PORT, descendants, stop_group
 from zsched_lab.fleet.testbed import TASK
 

@@ -15,10 +15,10 @@ import time
 
 import numpy as np
 
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.adapters.machine.device_profiler import DeviceProfiler
 from zsched.errors import AdapterError
 from zsched_lab.decisions.loads import Array
+from zsched_lab.fleet.groups import LimitedGroup
 
 PERIOD_S = 0.2
 QUOTA_CORES = 0.5

@@ -13,9 +13,9 @@ import os
 from collections.abc import Mapping
 from enum import StrEnum
 
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
+from zsched_lab.fleet.groups import LimitedGroup
 
 
 class LimitKind(StrEnum):

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.runner import LabFleet
 from zsched_lab.fleet.view import Status, find_task

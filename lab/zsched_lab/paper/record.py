@@ -10,7 +10,7 @@ is its header's stamp, the log time that of its arrival.
 quota of 0.2 cores shows 0.8 on an idle machine. So everything outside the nodes' quotas is put into a control group of
 the unified hierarchy, and that group's own pressure counts: the share of time in which some of it waited for a CPU.
 It stands for other machines, which no edge slows down: where the nodes want a CPU, too, it goes first, at once by the
-nodes' class (`zsched.adapters.machine.cgroup.LimitedGroup.give_way`), and by weight where the kernel has none.
+nodes' class (`zsched_lab.fleet.groups.LimitedGroup.give_way`), and by weight where the kernel has none.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ import os
 import sys
 from typing import Final
 
-from zsched.adapters.machine.cgroup import CgroupTree, LimitedGroup
+from zsched.adapters.machine.cgroup import CgroupTree
+from zsched_lab.fleet.groups import LimitedGroup
 
 OWN: Final = "own"
 """The group of the daemon and its relay, within the node's."""

@@ -1,4 +1,4 @@
-"""Finds the control groups that limit a process (v1, v2 or both), and makes a group with a quota where the user may.
+"""Finds the control groups that limit a process (v1, v2 or both).
 
 The limit that counts is the smallest of all ancestors, for CPU and for memory each. Its group's own accounting is then
 "what is in use": for a node inside a group the machine is that group.
@@ -9,22 +9,12 @@ Does not know: samples, rates, tasks, nodes.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
-import time
 from pathlib import Path
 
 from zsched.core.values.struct import Struct
-from zsched.errors import AdapterError
 
 MIB = 1024.0 * 1024.0
-PERIOD_US = 20_000
-"""Period of the quotas we set: a throttled process stands still for less than 20 ms instead of the usual 100."""
-MIN_QUOTA_US = 1000
-"""The kernel refuses less."""
-REMOVE_WITHIN_S = 1.0
-"""A group is busy until its killed processes are reaped, and for a moment after."""
 _UNLIMITED_V1 = 2**62
 
 
@@ -52,7 +42,7 @@ class CpuQuota(Struct, frozen=True, kw_only=True):
         if not self.is_v2:
             used_ns = _number(self.usage_folder / "cpuacct.usage")
             return None if used_ns is None else used_ns / 1e9
-        used_us = parse_flat(_text(self.folder / "cpu.stat")).get("usage_usec")
+        used_us = parse_flat(text_of(self.folder / "cpu.stat")).get("usage_usec")
         return None if used_us is None else used_us / 1e6
 
     def pressure_file(self) -> str | None:
@@ -72,7 +62,7 @@ class MemoryQuota(Struct, frozen=True, kw_only=True):
         usage = _number(self.folder / ("memory.current" if self.is_v2 else "memory.usage_in_bytes"))
         if usage is None:
             return None
-        inactive = parse_flat(_text(self.folder / "memory.stat")).get(
+        inactive = parse_flat(text_of(self.folder / "memory.stat")).get(
             "inactive_file" if self.is_v2 else "total_inactive_file", 0
         )
         return max(0.0, (usage - inactive) / MIB)
@@ -115,8 +105,8 @@ class CgroupTree:
     def __init__(self, root: Path = Path("/"), pid: str = "self") -> None:
         self._root = root
         proc = root / "proc" / pid
-        self._mounts = parse_mounts(_text(proc / "mountinfo"))
-        self._paths = parse_membership(_text(proc / "cgroup"))
+        self._mounts = parse_mounts(text_of(proc / "mountinfo"))
+        self._paths = parse_membership(text_of(proc / "cgroup"))
 
     def folders(self, controller: str) -> tuple[Path, ...]:
         """The process's groups that ``controller`` may limit, innermost first up to the mount point; empty: none."""
@@ -172,195 +162,10 @@ class CgroupTree:
         return next((other for other in chain[:-1] if other.name == folder.name), None)
 
 
-class LimitedGroup:
-    """A control group with a CPU quota and a memory limit, made for a node of the lab."""
-
-    def __init__(self, folders: tuple[Path, ...]) -> None:
-        """Wrap existing groups; use `create`."""
-        self.folders = folders
-
-    @classmethod
-    def create(
-        cls,
-        name: str,
-        *,
-        cpu_cores: float | None = None,
-        memory_mb: float | None = None,
-        tree: CgroupTree | None = None,
-    ) -> LimitedGroup:
-        """Make a group inside this process's own (v2: inside the nearest ancestor that may have children).
-
-        ``tree`` is this process's but in tests.
-
-        Raises:
-            AdapterError: the user may not, or the machine has no such controller; nothing is left behind.
-        """
-        tree = tree or CgroupTree()
-        values = _settings(tree, cpu_cores, memory_mb)
-        parents = {controller: _parent(tree, controller, tuple(values)) for controller in values}
-        group = cls(tuple(dict.fromkeys(parent / name for parent in parents.values())))
-        made: list[Path] = []
-        try:
-            for folder in group.folders:
-                folder.mkdir()
-                made.append(folder)
-            for controller, settings in values.items():
-                for file, value in settings:
-                    (parents[controller] / name / file).write_text(value, encoding="ascii")
-        except OSError as error:
-            for folder in made:
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
-            raise AdapterError(
-                f"cannot make the control group {name!r}: {error}; run as root, or inside a delegated group"
-            ) from error
-        return group
-
-    def inner(self, name: str, *, cpu_cores: float | None = None) -> LimitedGroup:
-        """Make a group inside this one, which holds no process of its own (version 2 asks for that).
-
-        Raises:
-            AdapterError: the user may not; nothing is left behind.
-        """
-        made: list[Path] = []
-        try:
-            for parent in self.folders:
-                if (parent / "cgroup.subtree_control").exists() and cpu_cores is not None:
-                    _delegate(parent, "cpu")
-                (parent / name).mkdir()
-                made.append(parent / name)
-                for file, value in [] if cpu_cores is None else _cpu_settings(parent / name, cpu_cores):
-                    (parent / name / file).write_text(value, encoding="ascii")
-        except (OSError, AdapterError) as error:
-            for folder in made:
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
-            raise AdapterError(f"cannot make the control group {name!r} in {self.folders[0]}: {error}") from error
-        return LimitedGroup(tuple(made))
-
-    def give_way(self) -> None:
-        """Let processes of other groups run at once where they want to, instead of in their turn (Linux >= 5.15).
-
-        The group is of the class of idle ones (sched(7), SCHED_IDLE; its own quota holds all the same). On an older
-        kernel nothing is done: then it has its turns by its weight.
-        """
-        for folder in self.folders:
-            with contextlib.suppress(OSError):
-                if (folder / "cpu.idle").exists():
-                    (folder / "cpu.idle").write_text("1", encoding="ascii")
-
-    @classmethod
-    def why_not(cls, *, cpu: bool = True, memory: bool = True) -> str | None:
-        """Why this user cannot limit processes here; ``None`` when they can (found out by making a group)."""
-        name = f"zsched-probe-{os.getpid()}"
-        try:
-            cls.create(name, cpu_cores=1.0 if cpu else None, memory_mb=64.0 if memory else None).remove()
-        except AdapterError as error:
-            return str(error)
-        return None
-
-    def add(self, pid: int) -> None:
-        """Move the process ``pid`` with all its threads into the group; its later children are born there.
-
-        Raises:
-            AdapterError: there is no such process, or the user may not move it.
-        """
-        try:
-            for folder in self.folders:
-                (folder / "cgroup.procs").write_text(str(pid), encoding="ascii")
-        except OSError as error:
-            raise AdapterError(f"cannot move process {pid} into {self.folders[0]}: {error}") from error
-
-    def pids(self) -> tuple[int, ...]:
-        """The processes in the group."""
-        return tuple(sorted({int(word) for folder in self.folders for word in _text(folder / "cgroup.procs").split()}))
-
-    def remove(self) -> None:
-        """Remove the group; kills nothing.
-
-        Raises:
-            AdapterError: processes are still inside (they are named).
-        """
-        end_s = time.monotonic() + REMOVE_WITHIN_S
-        for folder in self.folders:
-            while folder.exists():
-                try:
-                    folder.rmdir()
-                except OSError as error:
-                    if time.monotonic() >= end_s:
-                        raise AdapterError(f"cannot remove {folder}: {error}; inside: {self.pids()}") from error
-                    time.sleep(0.005)
-
-
-def _settings(
-    tree: CgroupTree, cpu_cores: float | None, memory_mb: float | None
-) -> dict[str, tuple[tuple[str, str], ...]]:
-    """``{controller: ((file, value), ...)}`` that the wanted limits need."""
-    values: dict[str, tuple[tuple[str, str], ...]] = {}
-    if cpu_cores is not None:
-        values["cpu"] = _quota_files(cpu_cores, is_v2=tree.is_v2("cpu"))
-        if not tree.is_v2("cpu"):
-            values["cpuacct"] = ()
-    if memory_mb is not None:
-        file = "memory.max" if tree.is_v2("memory") else "memory.limit_in_bytes"
-        values["memory"] = ((file, str(int(memory_mb * MIB))),)
-    return values
-
-
-def _quota_files(cpu_cores: float, *, is_v2: bool) -> tuple[tuple[str, str], ...]:
-    """((file, value), ...) of a quota, in the order in which they are written."""
-    quota_us = max(MIN_QUOTA_US, round(cpu_cores * PERIOD_US))
-    if is_v2:
-        return (("cpu.max", f"{quota_us} {PERIOD_US}"),)
-    return (("cpu.cfs_period_us", str(PERIOD_US)), ("cpu.cfs_quota_us", str(quota_us)))
-
-
-def _cpu_settings(folder: Path, cpu_cores: float) -> tuple[tuple[str, str], ...]:
-    """The same for a group that is there; none for one of another controller."""
-    if (folder / "cpu.max").exists():
-        return _quota_files(cpu_cores, is_v2=True)
-    return _quota_files(cpu_cores, is_v2=False) if (folder / "cpu.cfs_quota_us").exists() else ()
-
-
-def _parent(tree: CgroupTree, controller: str, wanted: tuple[str, ...]) -> Path:
-    """The group in which a child with ``controller`` can be made (v2: with all the v2 ones of ``wanted``).
-
-    Raises:
-        AdapterError: there is none.
-    """
-    folders = tree.folders(controller)
-    if not folders:
-        raise AdapterError(f"no {controller} control groups are mounted on this machine")
-    if not tree.is_v2(controller):
-        return folders[0]
-    needed = {name for name in wanted if tree.is_v2(name)}
-    for folder in folders:
-        is_root = not (folder / "cgroup.type").exists()
-        is_offered = needed <= set(_text(folder / "cgroup.controllers").split())
-        has_no_processes = is_root or not _text(folder / "cgroup.procs").split()
-        if is_offered and has_no_processes and os.access(folder, os.W_OK):
-            _delegate(folder, controller)
-            return folder
-    raise AdapterError(
-        f"no control group above this process may have children with {' and '.join(sorted(needed))}; "
-        "run as root on the host, or with `systemd-run --user --scope -p Delegate=yes`"
-    )
-
-
-def _delegate(folder: Path, controller: str) -> None:
-    """Hand ``controller`` down to the children of a v2 group."""
-    if controller in _text(folder / "cgroup.subtree_control").split():
-        return
-    try:
-        (folder / "cgroup.subtree_control").write_text(f"+{controller}", encoding="ascii")
-    except OSError as error:
-        raise AdapterError(f"cannot hand {controller!r} down in {folder}: {error}; run as root") from error
-
-
 def _quota(folder: Path, *, is_v2: bool) -> float | None:
     """The CPU quota of one group in cores; ``None`` when it has none."""
     if is_v2:
-        quota, _, period = _text(folder / "cpu.max").partition(" ")
+        quota, _, period = text_of(folder / "cpu.max").partition(" ")
         return int(quota) / int(period) if quota.isdecimal() and period.strip().isdecimal() and int(period) else None
     quota_us, period_us = _number(folder / "cpu.cfs_quota_us"), _number(folder / "cpu.cfs_period_us")
     return quota_us / period_us if quota_us and period_us else None
@@ -383,7 +188,7 @@ def _unescape(field: str) -> str:
     return re.sub(r"\\([0-7]{3})", lambda match: chr(int(match[1], 8)), field)
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
     """A small kernel file's text; empty when it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace")
@@ -393,5 +198,5 @@ def _text(path: Path) -> str:
 
 def _number(path: Path) -> int | None:
     """A kernel file that holds one number; ``None`` for anything else, "max" and negative numbers included."""
-    text = _text(path).strip()
+    text = text_of(path).strip()
     return int(text) if text.isdecimal() else None

@@ -14,12 +14,12 @@ from support.waiting import until
 from zsched.adapters.machine.cgroup import (
     CgroupTree,
     CpuQuota,
-    LimitedGroup,
     parse_flat,
     parse_membership,
     parse_mounts,
 )
 from zsched.errors import AdapterError
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.paper.work_group import OWN, WORK
 
 V2 = "30 25 0:26 / /sys/fs/cgroup rw,nosuid shared:9 - cgroup2 cgroup2 rw,nsdelegate\n"

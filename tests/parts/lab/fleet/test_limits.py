@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.errors import AdapterError
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.janitor import clean, groups_of
 from zsched_lab.fleet.limits import LimitKind, NodeLimits, by_affinity, make_limits
 

@@ -18,13 +18,13 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import free_endpoint, until
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.commands.watch.tracks import ROS_DEFINITIONS
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.fleet import application
 from zsched_lab.fleet.children import Children
+from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.signals import StopFlag
 from zsched_lab.paper.load import Loads, Window

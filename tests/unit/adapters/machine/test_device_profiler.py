@@ -14,7 +14,6 @@ import pytest
 
 from support.waiting import until
 from zsched.adapters.machine import device_profiler
-from zsched.adapters.machine.cgroup import LimitedGroup
 from zsched.adapters.machine.device_profiler import (
     DeviceProfiler,
     _ProcessTrees,
@@ -25,6 +24,7 @@ from zsched.adapters.machine.device_profiler import (
 )
 from zsched.core.values.profile import WorkerState
 from zsched.procfs import parse_process_stat, parse_schedstat
+from zsched_lab.fleet.groups import LimitedGroup
 
 MEMINFO = "MemTotal:        4096000 kB\nMemFree: 100 kB\nMemAvailable:    3072000 kB\nHugePages_Total: 0\n"
 V2 = "30 25 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw\n"
