@@ -71,6 +71,7 @@ def cast(world: World) -> tuple[Entry, ...]:
             limits=entries.foreseeing(world),
             make=entries.core(world, patience=RADIO_PATIENCE, form=ScoreForm.SERVICE),
         ),
+        Entry(name="ledger", make=entries.by_ledger(world)),
         *(
             Entry(name=f"timer, bonus {bonus:g}", make=entries.timed(world, bonus=bonus))
             for bonus in (0.03, 0.05, 0.07)

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S, PAPER_PATIENCE, LinkLimits
 from zsched.core.values.model import PairReading, ScoreForm, Tuning, Weights
+from zsched_lab.decisions.ledger import BONUS, Ledger
 from zsched_lab.decisions.replay import Entry
 from zsched_lab.decisions.rules import (
     BlindRule,
@@ -66,6 +67,12 @@ def core(
 def foreseeing(world: World, lead_s: float = DEFAULT_FORESEE_S, **more: Any) -> LinkLimits | None:
     """The limits of a task that counts signals ``lead_s`` ahead; the world's own where there is no radio."""
     return None if world.signal is None else LinkLimits(foresee_s=lead_s, **more)
+
+
+def by_ledger(world: World) -> Callable[[Sight], Rule]:
+    """The production's decision by a ledger in place of patience; it needs no foresight."""
+    tuning = Tuning(weights=world.spec.tuning.weights, score=ScoreForm.SERVICE, bonus=BONUS, cool_down_s=0.0)
+    return lambda view: CoreRule(view, tuning, ledger=Ledger)
 
 
 def ours(world: World) -> tuple[Entry, ...]:

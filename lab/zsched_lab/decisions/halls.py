@@ -60,6 +60,7 @@ def cast(world: World) -> tuple[Entry, ...]:
             )
             for patience in PATIENCES
         ),
+        Entry(name="ledger", make=entries.by_ledger(world)),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),
     )

@@ -24,6 +24,7 @@ from zsched.core.values.decision import Figures, Rules
 from zsched.core.values.fleet import PAPER_PATIENCE, TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, ScoreForm, Tuning
 from zsched.core.vote.tally import VoteOutcome, tally
+from zsched_lab.decisions.ledger import Ledger, LedgerJudge
 from zsched_lab.decisions.view import Sight
 
 COMMIT_S = 0.03
@@ -94,6 +95,8 @@ class CoreRule:
     patience: float = PAPER_PATIENCE
     learns_patience: bool = False
     time_to_trigger_s: float | None = None
+    ledger: Callable[[], Ledger] | None = None
+    """In place of patience."""
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
@@ -110,6 +113,8 @@ class CoreRule:
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
 
     def _new_judge(self) -> Judge:
+        if self.ledger is not None:
+            return LedgerJudge(self._spec, self.ledger())
         timer_s = self.time_to_trigger_s
         return Judge(spec=self._spec) if timer_s is None else TimedJudge(self._spec, timer_s)
 

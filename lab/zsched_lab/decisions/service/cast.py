@@ -9,6 +9,7 @@ import types
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from enum import Enum
+from functools import partial
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from zsched.core.scheduler.patience import FIRST_PATIENCE
@@ -20,6 +21,7 @@ from zsched.core.values.fleet import (
     TaskSpec,
 )
 from zsched.core.values.model import ScoreForm, Tuning, Weights
+from zsched_lab.decisions import ledger
 from zsched_lab.decisions.entries import CPU_ONLY, MEMORY_ONLY, PAPER_COST, RAW
 from zsched_lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched_lab.decisions.service.replay import Deadline, Player, is_of_task
@@ -27,9 +29,11 @@ from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
 from zsched_lab.paper.schemes import PAPER_BONUS
 
-OWN: Final = ("smoothing_s", "is_told", "tells_jobs", "time_to_trigger_s")
+LEDGER: Final = ("price_s", "memory_s", "ahead_s")
+OWN: Final = (*LEDGER, "smoothing_s", "is_told", "tells_jobs", "time_to_trigger_s")
 """Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
-``tells_jobs=0``: the worker says nothing of its jobs; ``time_to_trigger_s``: in place of patience, as it once was."""
+``tells_jobs=0``: the worker says nothing of its jobs; ``time_to_trigger_s``: in place of patience, as it once was;
+those of `LEDGER`: by a ledger (`zsched_lab.decisions.ledger`), which has none of patience, cool-down and cap."""
 
 
 def players() -> tuple[Player, ...]:
@@ -37,6 +41,7 @@ def players() -> tuple[Player, ...]:
     return (
         zsched("service"),
         zsched("paper", score=ScoreForm.PAPER),
+        zsched("ledger", price_s=ledger.PRICE_S, bonus=ledger.BONUS),
         _picks("dyna_cpu", CPU_ONLY, PAPER_COST),
         _picks("dyna_mem", MEMORY_ONLY, PAPER_COST),
         _picks("dyna_both", EVEN, PAPER_COST),
@@ -59,6 +64,10 @@ def zsched(name: str, **settings: Any) -> Player:
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
     is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
     trigger_s = given.pop("time_to_trigger_s", None)
+    by = {name: given.pop(name) for name in LEDGER if name in given}
+    made = partial(ledger.Ledger, **by) if by else None
+    if made is not None:
+        given = {"cool_down_s": 0.0, "max_moves_per_minute": None, **given}
     if trigger_s is None:
         if "patience" not in changes:
             changes.setdefault("learns_patience", is_service)
@@ -67,7 +76,7 @@ def zsched(name: str, **settings: Any) -> Player:
     tuning = Tuning(**{"weights": EVEN, **given})
     return Player(
         name=name,
-        make=_core(tuning, changes, trigger_s),
+        make=_core(tuning, changes, trigger_s, made),
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
@@ -77,9 +86,14 @@ def zsched(name: str, **settings: Any) -> Player:
     )
 
 
-def _core(tuning: Tuning, changes: Mapping[str, Any], trigger_s: float | None) -> Callable[[Sight], Rule]:
+def _core(
+    tuning: Tuning,
+    changes: Mapping[str, Any],
+    trigger_s: float | None,
+    made: Callable[[], ledger.Ledger] | None,
+) -> Callable[[Sight], Rule]:
     own = {name: changes[name] for name in ("patience", "learns_patience") if name in changes}
-    return lambda view: CoreRule(view, tuning, time_to_trigger_s=trigger_s, **own)
+    return lambda view: CoreRule(view, tuning, time_to_trigger_s=trigger_s, ledger=made, **own)
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:

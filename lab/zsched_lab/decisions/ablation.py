@@ -1,0 +1,60 @@
+"""``python -m zsched_lab.decisions.ablation OFF service ...``: the study with mechanisms of forecasting switched off.
+
+``OFF`` is one name of `SWITCHES` or several with commas between; what follows is as for `zsched_lab.decisions`.
+
+Knows: which function or figure each mechanism hangs on. Does not know: what it earns.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from zsched.core.gateway import demand, sharing, shortfall, task_speed
+from zsched.core.gateway.job_need import JobNeed
+from zsched.core.gateway.sharing import Shares
+from zsched.core.scheduler import utility
+from zsched_lab.decisions.__main__ import main
+
+Switch = tuple[Any, str, Any]
+"""What is set, under which name, to what."""
+
+
+def _always(value: object) -> Callable[..., object]:
+    return lambda *_given, **_more: value
+
+
+def _at_without_experience(shares: Shares, *given: Any) -> float:
+    """A fair share that is believed wherever the task has been."""
+    getattr(shares, "_got").clear()  # noqa: B009 - the study reaches into the product here, and nowhere else
+    cores: float = _AT(shares, *given)
+    return cores
+
+
+_AT: Final = Shares.at
+SWITCHES: Final[Mapping[str, tuple[Switch, ...]]] = {
+    "task-speeds": ((task_speed.TaskSpeeds, "note", _always(None)),),
+    "shortfalls": ((shortfall.Shortfalls, "note", _always(False)),),
+    "doubts": ((shortfall, "_waits", _always(True)),),
+    "fair-share": ((Shares, "at", _always(0.0)),),
+    "kept-share": ((Shares, "at", _at_without_experience),),
+    "others-beside": ((getattr(sharing, "_Others"), "expected", lambda _known, seen: seen),),  # noqa: B009 - as above
+    "settling": ((demand, "SETTLE_S", 0.0),),
+    "calm": ((demand, "CALM_S", 0.0),),
+    "guess": ((demand, "UNSURE", 1.0),),
+    "compared": ((demand, "COMPARED_S", -1.0),),
+    "told-lack": ((demand, "_told", _always(None)),),
+    "one-thread": ((JobNeed, "most_cores", _always(None)),),
+    "least-need": ((utility, "LEAST_NEED_RATIO", 0.0),),
+    "free-room": ((utility, "SPARE", 0.005),),
+    "memory-floor": ((utility, "NEARLY_FULL", 0.0),),
+}
+"""{mechanism: what switches it off}."""
+
+
+if __name__ == "__main__":
+    for name in filter(None, sys.argv.pop(1).split(",")):
+        for place, attribute, value in SWITCHES[name]:
+            setattr(place, attribute, value)
+    main()
