@@ -1,10 +1,11 @@
 """What a fleet's streams lose while it gets another version, node by node: old and new beside each other, and back.
 
-``python -m benchmarks.rolling --old REF [--hz 50]``. Two robots and two edges on one machine begin by the code of the
-commit REF, with today's libraries. Each node in turn is restarted as `systemctl restart` does it, by this tree's code:
-edges first, then robots; then all go back. An application on each robot sends a `reliable` stream to the owner and
-hears the answers. One line for each restart: the versions then, sent, lost and doubled of both robots, the longest
-pause between two answers, whether the node's relay went on.
+``python -m benchmarks.rolling --old REF [--hz 50] [--task reliable|exclusive|best_effort]``. Two robots and two edges
+on one machine begin by the code of the commit REF, with today's libraries. Each node in turn is restarted as `systemctl
+restart` does it, by this tree's code: edges first, then robots; then all go back. An application on each robot sends a
+stream to the owner and hears the answers: of class `reliable`, also to the task that is `exclusive`, or `best_effort`.
+One line for each restart: the versions then, sent, lost and doubled of both robots, the longest pause between two
+answers, whether the node's relay went on.
 """
 
 from __future__ import annotations
@@ -97,8 +98,8 @@ def judged(streams: dict[NodeId, Stream], first: dict[NodeId, int], last: dict[N
         numbers = range(first[robot], last[robot])
         sent, lost = sent + len(numbers), lost + sum(found[one] == 0 for one in numbers)
         doubled += sum(found[one] > 1 for one in numbers)
-        times = [when for _, when in stream.answers if when >= began]
-        pause = max([pause, *(after - before for before, after in pairwise(times))])
+        times = [when for _, when in stream.answers]
+        pause = max([pause, *(after - before for before, after in pairwise(times) if after >= began)])
     return f"sent {sent:5}  lost {lost}  doubled {doubled}  longest pause {1000 * pause:5.0f} ms"
 
 
@@ -107,10 +108,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--old", required=True, metavar="REF")
     parser.add_argument("--hz", type=float, default=50.0)
+    parser.add_argument("--task", choices=("reliable", "exclusive", "best_effort"), default="reliable")
     given = parser.parse_args()
     print(machine())
-    tree = echo_fleet(robots=len(ROBOTS), edges=len(EDGES), stream_class="reliable")
-    tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
+    stream_class = "best_effort" if given.task == "best_effort" else "reliable"
+    tree = echo_fleet(robots=len(ROBOTS), edges=len(EDGES), stream_class=stream_class)
+    tree["tasks"][TASK]["exclusive"] = given.task == "exclusive"
+    tree["electorate"] = [*ROBOTS, EDGES[0]]  # one at a time may be away
+    if stream_class == "reliable":
+        tree["tasks"][TASK]["outputs"][0]["handover"] = "all"
     with tempfile.TemporaryDirectory() as name:
         old = code_of(given.old, Path(name) / "old")
         (Path(name) / "bed").mkdir()

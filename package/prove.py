@@ -7,8 +7,8 @@ Steps (all of them unless some are named), each of which says `ok`, `FAILED` wit
     bookworm trixie  the package as it is shipped, in a booted Debian 12 and 13: from the older version REF and back
     jammy            the same in Ubuntu 22.04, whose python3 is too old: with a Python of its own (PYTHON_DIST)
     pip              a virtual environment and `zsched install`, upgraded, rolled back and taken away
-    relay            upgrades from a relay of other code, of more words and of fewer, which goes on; and from one of
-                     other words, which is replaced
+    relay            upgrades from a relay of other code, which goes on, and from one of another protocol, which is
+                     replaced
     arm              the package for aarch64: what is in it, and its Python under qemu where that is installed
     image            the container image: built, run, asked, stopped
 
@@ -47,10 +47,7 @@ TEST = REPO / "tests/booted/test_deb.py"
 E_MACHINE = {"x86_64": 62, "aarch64": 183}
 """Of ELF files, by machine."""
 RELAYS_CODE = "lib/site-packages/zsched/relay/process.py"
-RELAYS_WORDS = "lib/site-packages/zsched/core/values/plan.py"
-ONE_MORE = ("    exclusive: bool = False\n", "    exclusive: bool = False\n    urgency: int = 0\n")
-OTHER = ("    keep_last: int = key(1,", "    keep_last: int = key(2,")
-"""A default: left out by the one, it means something else to the other."""
+RELAYS_PROTOCOL = "lib/site-packages/zsched/ipc/takeover.py"
 
 
 @dataclass(slots=True)
@@ -140,16 +137,10 @@ def say_report(report: dict[str, Any], *, same: bool, took_s: float) -> None:
 
 
 def relay_goes_on(old: Path, new: Path, folder: Path) -> bool:
-    """Whether the new version's daemon goes on with the old version's relay, by what both say of their words."""
-    before, after = unpacked(old, folder), unpacked(new, folder)
-    if not all((site / "zsched/ipc/vocabulary.py").exists() for site in (before, after)):
-        return relay_words(before) == relay_words(after)
-    said = asked(before, "from zsched.ipc.vocabulary import own, written; print(written(own()))")
-    judge = "from zsched.ipc.vocabulary import misunderstanding, own, read"
-    why = asked(after, f"{judge}; print(misunderstanding(read({said!r}), own()))")
-    if why:
-        print(f"  {why}")
-    return not why
+    """Whether the new version's daemon goes on with the old version's relay."""
+    ask = "from zsched.ipc.takeover import PROTOCOL; print(PROTOCOL)"
+    before, after = (asked(unpacked(package, folder), ask) for package in (old, new))
+    return before == after
 
 
 def unpacked(package: Path, folder: Path) -> Path:
@@ -163,12 +154,6 @@ def unpacked(package: Path, folder: Path) -> Path:
     else:
         run("dpkg-deb", "-x", str(package), str(tree))
     return site
-
-
-def relay_words(site: Path) -> str:
-    """The digest by which earlier versions' daemons go on with a relay. Before 2026-11-25 they went by the code."""
-    word = "ipc.words import words" if (site / "zsched/ipc/words.py").exists() else "ipc.takeover import code"
-    return asked(site, f"from zsched.{word}_digest as digest; print(digest())")
 
 
 def asked(site: Path, ask: str) -> str:
@@ -190,27 +175,19 @@ def in_jammy(work: Work) -> None:
 
 
 def other_relay(work: Work) -> None:
-    """A relay of other code, more words or fewer goes on; one that takes a word for something else is replaced."""
+    """A relay of other code goes on; one of another protocol is replaced."""
 
     def code(home: Path) -> None:
         path = home / RELAYS_CODE
         path.write_text(path.read_text() + "\n# Other code.\n")
 
-    def words(old: str, new: str) -> Callable[[Path], None]:
-        def change(home: Path) -> None:
-            path = home / RELAYS_WORDS
-            text = path.read_text()
-            if old not in text:
-                raise FailedError(f"{RELAYS_WORDS} has no {old!r}")
-            path.write_text(text.replace(old, new, 1))
-
-        return change
+    def protocol(home: Path) -> None:
+        path = home / RELAYS_PROTOCOL
+        path.write_text(re.sub(r"\nPROTOCOL: Final = \d+\n", "\nPROTOCOL: Final = 0\n", path.read_text(), count=1))
 
     new = work.new()
     tried(work, SUITE, another(new, "0.0.2", work.folder, code), new)
-    tried(work, SUITE, another(new, "0.0.3", work.folder, words(*ONE_MORE)), new)
-    tried(work, SUITE, new, another(new, "9.0.4", work.folder, words(*ONE_MORE)))
-    tried(work, SUITE, another(new, "0.0.5", work.folder, words(*OTHER)), new)
+    tried(work, SUITE, another(new, "0.0.3", work.folder, protocol), new)
 
 
 def by_pip(work: Work) -> None:

@@ -13,7 +13,6 @@ from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.words import NO_SPARE, has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
-from zsched.ipc.takeover import code_digest
 
 RENEW_RELAY: Final = "when this robot stands still: sudo systemctl stop zsched && sudo systemctl start zsched"
 
@@ -49,13 +48,13 @@ def judged_lag(node: str, status: Json, beat_s: float, suspect_s: float) -> Resu
 
 
 def is_of_this_version(scene: Scene) -> Result:
-    """Whether the daemon is of the version that is installed here, and its relay of that version's code."""
+    """Whether the daemon is of the version that is installed here, and its relay, too."""
     running = scene.status["version"]
     if running != __version__:
         told = f"the daemon is zsched {running}, installed is {__version__}"
         return warned(told, fix="sudo systemctl restart zsched")
-    if scene.relay_code not in ("", code_digest()):
-        told = f"the daemon is zsched {running}; its relay carries the streams on by the code of another version"
+    if scene.relay_version not in ("", __version__):
+        told = f"the daemon is zsched {running}; its relay carries the streams on by the code of {scene.relay_version}"
         return warned(told, fix=RENEW_RELAY)
     return passed(f"zsched {running}")
 

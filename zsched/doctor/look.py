@@ -81,7 +81,7 @@ def look(machine: Machine, *, is_fleet: bool) -> Scene:
         revision=revision,
         unseated=without_seat,
         node=node,
-        relay_code=_relay_code(machine.runtime_folder, node),
+        relay_version=_relay_version(machine.runtime_folder, node),
         state_folder=machine.state_folder,
         own=own,
         refusal=refusal,
@@ -143,10 +143,10 @@ def _sides(door: Path, node: NodeId) -> Mapping[str, str]:
     return found
 
 
-def _relay_code(folder: Path, node: NodeId) -> str:
+def _relay_version(folder: Path, node: NodeId) -> str:
     """Of the relay's note."""
     note = Door(folder, node).note()
-    return "" if note is None else note.code
+    return "" if note is None else note.version
 
 
 def _own(door: Path) -> tuple[Json | None, str]:

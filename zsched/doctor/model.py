@@ -124,8 +124,8 @@ class Scene(Struct, frozen=True, kw_only=True):
     """The status of the daemon on this machine; ``None`` when it does not answer."""
     refusal: str = ""
     """Why it does not."""
-    relay_code: str = ""
-    """The digest of the code that the relay here runs; empty: none runs, or its note may not be read."""
+    relay_version: str = ""
+    """Of the relay that runs here; empty: none runs, or its note may not be read."""
     is_fleet: bool = False
     statuses: Mapping[NodeId, Json] = field(default_factory=dict)
     """Of every node that answers, with ``is_fleet``; the own one is among them."""

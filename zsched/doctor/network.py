@@ -103,7 +103,7 @@ def _leads_here(host: str) -> bool:
 def ports_are_ours(scene: Scene) -> Result:
     """Whether somebody listens where this node's sessions do while its daemon runs, and else nobody."""
     listens = {"control": scene.me.listen_control, "data": scene.me.listen_data}
-    if scene.own is None and scene.relay_code:
+    if scene.own is None and scene.relay_version:
         del listens["data"]  # a relay outlives its daemon
     here = {session: end for session, listen in listens.items() if (end := Endpoint.of(dialled_here(listen))).port}
     fixed = {session: end for session, end in here.items() if end.protocol in OVER_TCP}

@@ -33,7 +33,7 @@ class RelayHello(Struct, frozen=True, kw_only=True):
     incarnation: int
     """Of the daemon's durable state: it rises with every start."""
     digest: str
-    """Over the words of the pipe, the host's own side and all else that a process keeps for its life (`digest_of`)."""
+    """Over the protocol, the host's own side and all else that a process keeps for its life (`digest_of`)."""
     session: str = ""
     """A digest over what its data session is opened with: access rules, certificate, addresses."""
     threads: int = 0

@@ -1,6 +1,6 @@
-"""Where a relay that outlived its daemon is found again: a socket, a lock with a note, and the words it says.
+"""Where a relay that outlived its daemon is found again: a socket, and a lock with a note.
 
-Knows: the three files of a node's relay in the runtime folder, flock(2), the words before the pipe's first frame. Does
+Knows: the files of a node's relay in the runtime folder, flock(2), the words before the pipe's first frame. Does
 not know: how relays are started, zenoh, plans.
 
 The lock is held by the relay process alone, by a file description it inherits, so the kernel gives it back however the
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import json
 import os
 import select
@@ -21,7 +20,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import asdict
 from hashlib import blake2s
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,35 +29,11 @@ from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, WireError
 from zsched.ipc.pipe import read_frame, write_frame
 from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
-from zsched.ipc.vocabulary import Vocabulary, own, read, written
 from zsched.wire import codec as wire
 
-PACKAGE: Final = Path(__file__).parents[1]
-THE_RELAYS: Final = (
-    "relay",
-    "ipc",
-    "hop",
-    "sessions",
-    "wire",
-    "core/__init__.py",
-    "core/events.py",
-    "core/hop",
-    "core/membership",
-    "core/relay_protocol.py",
-    "core/route",
-    "core/values",
-    "__init__.py",
-    "clock.py",
-    "heap.py",
-    "errors.py",
-    "guard.py",
-    "log_limit.py",
-)
-"""What a relay may load, of this package: a test holds it to the imports."""
-PROTOCOL: Final = 1
-"""Raised whenever a relay and a daemon of other code would misunderstand each other all the same: words with another
-meaning, a report that the daemon waits for and an earlier relay never sends (`zsched.ipc.vocabulary`), or other
-configurations before them."""
+PROTOCOL: Final = 2
+"""Another one of a relay and a daemon means: the relay is replaced. Raised whenever one of them would misunderstand the
+other, or needs a word that the other does not know (the codec reads past what it does not know)."""
 GREETING_S: Final = 1.0
 """A relay that does not answer for this long is no relay to go on with."""
 _ANSWERS: Final[tuple[type[Any], ...]] = (RelayHere, RelayRefused)
@@ -73,8 +47,8 @@ class Note(Struct, frozen=True, kw_only=True):
 
     pid: int
     listen: str
-    code: str = ""
-    """The digest of the code that it runs (`code_digest`); empty: not known."""
+    version: str = ""
+    """Of the program that it runs; empty: not known."""
 
 
 class Claim(Struct, kw_only=True):
@@ -93,7 +67,6 @@ class Door:
     """The files of one node's relay."""
 
     def __init__(self, folder: Path, node: NodeId) -> None:
-        self._words = folder / f"{node}.relay.words"
         self._socket = folder / f"{node}.relay"
         self._next = folder / f"{node}.relay.next"
         self._lock = folder / f"{node}{_LOCK}"
@@ -150,19 +123,8 @@ class Door:
         except OSError as error:
             raise AdapterError(f"cannot listen on {self._socket}: {error}; check --runtime-dir") from error
 
-    def words(self, note: Note) -> Vocabulary | None:
-        """What the relay of the note can be told and tells; ``None``: it is not known."""
-        try:
-            pid, _, text = self._words.read_text(encoding="utf-8").partition("\n")
-        except (OSError, ValueError):
-            return None
-        return read(text) if pid == str(note.pid) else None
-
     def sign(self, claim: Claim, note: Note) -> None:
-        """Write down which relay has taken the claim; it is of this version, and says this version's words."""
-        with contextlib.suppress(OSError):  # without them a daemon of other words replaces it
-            self._words.write_text(f"{note.pid}\n{written(own())}", encoding="utf-8")
-            self._words.chmod(0o600)
+        """Write down which relay has taken the claim."""
         os.ftruncate(claim.lock, 0)
         os.pwrite(claim.lock, json.dumps(asdict(note)).encode(), 0)
 
@@ -195,7 +157,7 @@ class Door:
 
     def remove(self) -> None:
         """Remove the files, once the relay is gone."""
-        for path in (self._socket, self._next, self._words, *books_files(self.books), self._lock):
+        for path in (self._socket, self._next, *books_files(self.books), self._lock):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
@@ -229,31 +191,6 @@ def digest_of(*parts: str) -> str:
     return state.hexdigest()
 
 
-def code_files() -> list[Path]:
-    """The sources that decide how a relay behaves, sorted."""
-    return sorted(
-        path
-        for name in THE_RELAYS
-        for path in ([PACKAGE / name] if name.endswith(".py") else (PACKAGE / name).rglob("*.py"))
-    )
-
-
-@functools.cache
-def code_digest() -> str:
-    """16 hex digits over the code that relays run: what they may load of this package, and which zenoh library.
-
-    It replaces no relay: it says whether the one that runs is of the code that is installed.
-    """
-    state = blake2s(digest_size=8)
-    for path in code_files():
-        state.update(f"{path.relative_to(PACKAGE)} {path.stat().st_size}\n".encode() + path.read_bytes())
-    zenoh = find_spec("zenoh")
-    for library in sorted(Path(zenoh.origin).parent.glob("*.so")) if zenoh is not None and zenoh.origin else ():
-        found = library.stat()
-        state.update(f"{library.name} {found.st_size} {found.st_mtime_ns}".encode())
-    return state.hexdigest()
-
-
 def _is_answered(link: socket.socket, goes_on: Callable[[float, float], bool]) -> bool:
     """Wait for an answer; false once ``goes_on`` says that waiting is of no use."""
     poller = select.poll()
@@ -282,6 +219,6 @@ def user_of(link: socket.socket) -> int:
 def _read_note(text: bytes) -> Note | None:
     try:
         found = json.loads(text)
-        return Note(pid=int(found["pid"]), listen=str(found["listen"]), code=str(found.get("code", "")))
+        return Note(pid=int(found["pid"]), listen=str(found["listen"]), version=str(found.get("version", "")))
     except (ValueError, KeyError, TypeError):
         return Note(pid=0, listen="")  # it has only just been started

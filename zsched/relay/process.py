@@ -3,9 +3,8 @@
 Knows: how commands become tasks' plans and roles, how reports leave, how to go on without a daemon for a while, how to
 end within a second. Does not know: how a stream is carried.
 
-Without a daemon the streams run on: plans are obeyed as they are. Two things do not: no worker gets a role (those of
-this node died with the daemon, the next daemon says what the next ones are), and what an exclusive task puts out waits
-at the gate, for nobody here would learn that it has another owner.
+Without a daemon the streams run on: plans are obeyed as they are, and what owners put out passes (an exclusive one puts
+out nothing without its lease). No worker gets a role: those of this node died with the daemon.
 """
 
 from __future__ import annotations

@@ -3,10 +3,9 @@
 Knows: the listening socket in the runtime folder, who may take this relay over. Does not know: why the daemon went,
 what is carried meanwhile.
 
-A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher), says the
-same words to a relay (`zsched.ipc.words`; its code may be another version's), and has the same Python and the same
-session on the host's own side: anything else makes a new relay necessary. Its data session may be another one where the
-host has a side of its own (docs/decisions/0071).
+A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher), and has the
+same protocol, Python and session on the host's own side: anything else makes a new relay necessary. Its code may be
+another version's, and its data session another one where the host has a side of its own (docs/decisions/0071).
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class Successors:
         if hello.incarnation <= mine.incarnation:
             return f"incarnation {hello.incarnation} is not after {mine.incarnation}, whose relay this is"
         if hello.digest != mine.digest:
-            return "its words, its Python or its host's own side are not those that this relay was started with"
+            return "its protocol, its Python or its host's own side are not those that this relay was started with"
         if hello.threads > mine.threads:
             return f"the fleet has grown: {hello.threads} threads are needed, this relay has {mine.threads}"
         if hello.session != mine.session and not self._reopens:

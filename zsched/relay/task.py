@@ -233,7 +233,7 @@ class TaskRelay:
                     self._finish(plan)
                     return
                 if isinstance(plan, Orphaned):
-                    self._pause()
+                    self._is_inherited = True
                 elif isinstance(plan, Unowned):
                     self._listen(plan.routes)
                 elif isinstance(plan, Leave):
@@ -355,12 +355,6 @@ class TaskRelay:
 
     # --- plans -------------------------------------------------------------------------------------------------------
 
-    def _pause(self) -> None:
-        self._is_inherited = True
-        if self._plan is not None and self._plan.exclusive:
-            for sink in self._streams.outputs.values():
-                sink.pause()
-
     def _close_all(self) -> None:
         for epoch in sorted(self._slots):
             self._close(epoch)
@@ -425,8 +419,6 @@ class TaskRelay:
         current = self._current()
         if current is not None:
             self._follow(plan.phase, current)
-        for sink in self._streams.outputs.values():
-            sink.resume(0 if plan.current is None else plan.current.epoch)
         self._forget_streams()
         self._graph.set_routes(
             self._task, tuple(route for state in self._slots.values() for route in state.slot.routes)

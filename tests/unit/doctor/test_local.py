@@ -16,6 +16,7 @@ import pytest
 from support.clinic import FLEET, answer, assert_finds, make_state, run, scene_of, status_of
 from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
+from zsched import __version__
 from zsched.adapters.host.document_store import DocumentStore
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.adapters.machine.device_profiler import DeviceProfiler
@@ -30,7 +31,6 @@ from zsched.doctor import machine, state
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Check, Scene, Verdict
 from zsched.doctor.table import CHECKS, run_all
-from zsched.ipc.takeover import code_digest
 from zsched.wire.codec import as_plain, document_hash
 
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
@@ -324,10 +324,8 @@ def test_a_daemon_of_another_version_is_found(tmp_path: Path) -> None:
 
 def test_a_relay_of_another_versions_code_is_found(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
-    assert run("daemon.version", replace(scene, relay_code=code_digest())).verdict is PASS
-    assert_finds(
-        run("daemon.version", replace(scene, relay_code="0123456789abcdef")), WARN, "by the code of another version"
-    )
+    assert run("daemon.version", replace(scene, relay_version=__version__)).verdict is PASS
+    assert_finds(run("daemon.version", replace(scene, relay_version="0.1")), WARN, "by the code of 0.1")
 
 
 def test_a_decision_loop_that_lags_is_found(tmp_path: Path) -> None:
@@ -604,7 +602,7 @@ def test_another_program_on_our_port_is_found(tmp_path: Path, listener: tuple[so
 def test_a_relay_without_its_daemon_is_no_other_program(tmp_path: Path, listener: tuple[socket.socket, int]) -> None:
     scene = replace(scene_of(tmp_path, FLEET.replace("21258", str(listener[1]))), own=None)
     assert run("net.ports", scene).verdict is WARN
-    assert run("net.ports", replace(scene, relay_code="0" * 16)).verdict is PASS
+    assert run("net.ports", replace(scene, relay_version="0.1")).verdict is PASS
 
 
 def test_a_daemon_that_does_not_listen_where_it_should_is_found(

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable
 
+from zsched import __version__
 from zsched.clock import awake_s
 from zsched.errors import AdapterError
 from zsched.ipc.takeover import Claim, Door, Note
@@ -115,10 +116,9 @@ def start_relay(
     command: list[str],
     door: Door | None = None,
     listen: str = "",
-    code: str = "",
     ends_other: Callable[[RelayChild], None] = lambda _next: None,
 ) -> RelayChild:
-    """Start a relay; with ``door`` it can be found again there, with where its session listens and its code.
+    """Start a relay; with ``door`` it can be found again there, with where its session listens.
 
     ``ends_other`` is called when it runs, before it has the place: the relay that has it yet ends then.
 
@@ -143,7 +143,7 @@ def start_relay(
             child.kill()
             child.close()
             raise
-        door.sign(claim, Note(pid=child.pid, listen=listen, code=code))
+        door.sign(claim, Note(pid=child.pid, listen=listen, version=__version__))
     return child
 
 

@@ -13,13 +13,13 @@ from __future__ import annotations
 import logging
 import os
 import select
-import socket
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from zsched import __version__
 from zsched.adapters.relay.child import ENDING_S, RelayChild, start_relay
 from zsched.adapters.relay.silence import Silence
 from zsched.clock import awake_s
@@ -27,14 +27,12 @@ from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, TaskEnded, WorkerWatch
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePlan
-from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
-from zsched.ipc.protocol import RelayHello, RelayHere, RelayPulse
-from zsched.ipc.takeover import GREETING_S, Door, Note, code_digest, digest_of
-from zsched.ipc.vocabulary import Vocabulary, lack, misunderstanding, own
-from zsched.ipc.words import words_digest
+from zsched.ipc.protocol import RelayHello, RelayPulse
+from zsched.ipc.takeover import GREETING_S, Door, digest_of
 from zsched.wire import codec as wire
 
 BACKOFF_MIN_S: Final = 0.1
@@ -103,7 +101,7 @@ class Bequest(Struct, frozen=True, kw_only=True):
     incarnation: int
     """This daemon's; only a later one may take the relay over."""
     digest: str
-    """Over everything beside sessions and words that a running relay must agree with (`digest_of`)."""
+    """Over everything beside sessions that a running relay must agree with (`digest_of`)."""
     listen: str = ""
     """Where the data session listens, for the next daemon."""
     certificate: str = ""
@@ -143,15 +141,14 @@ class RelayHandle:
         self._silence_s = min(silence_s, STARVED_S)
         self._bequest = bequest
         self._streams = streams
-        self._command = [python, "-m", "zsched.relay", "--fleet", fleet, "--node", node]
+        self._command = [python, "-P", "-m", "zsched.relay", "--fleet", fleet, "--node", node]
         spare = 0 if bequest is None else bequest.spare_threads
         self._command += ["--threads", str(threads + spare), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
         if streams is not None:
             self._command += ["--streams", str(streams[0]), "--streams-listen", streams[1]]
         if bequest is not None:
-            self._kept = (bequest.digest, python, local_config)
-            digest = self._digest(words_digest())
+            digest = digest_of(bequest.digest, python, local_config)
             session = digest_of(zenoh_config, bequest.certificate)
             self._hello = RelayHello(
                 fleet=fleet,
@@ -170,10 +167,6 @@ class RelayHandle:
         self._relay: RelayChild | None = None
         self._reopens = False
         """The relay that was taken over waits for the configuration of its data session."""
-        self._its_words: Vocabulary | None = None
-        """Of a relay that was taken over and has other words than we..."""
-        self._lack = ""
-        """...and what we have to say that it does not know: another one has to follow."""
         self._stopping = threading.Event()
         self._is_leaving = False
         self._thread = guarded(self._supervise, name="relay")
@@ -253,9 +246,6 @@ class RelayHandle:
             found = None
             if self._stopping.is_set():
                 return
-            if (relay := self._relay) is not None and self._lack:
-                found = self._outgrown(relay)
-                continue
             backoff = 0.0 if awake_s() - started_at > CALM_S else backoff
             _log.warning("the relay is gone (%s), next one in %.1f s", reason, backoff)
             self._on_report(RelayChanged(is_running=False, reason=reason))
@@ -269,44 +259,17 @@ class RelayHandle:
         if bequest is None or note is None:
             return None
         silence = Silence(note.pid, GREETING_S)
-        hello = self._hello_to(note, bequest)
-        if isinstance(hello, str):
-            found: tuple[socket.socket, RelayHere] | str = hello
-        else:
-            found = bequest.door.connect(hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
+        found = bequest.door.connect(self._hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
         if isinstance(found, str):
             _log.warning("the relay that runs here (pid %d) is replaced: %s", note.pid, found)
             return self._replaced(RelayChild(pid=note.pid, link=None, door=bequest.door))
         link, here = found
         self._reopens = here.reopens
         how = ", and opens its data session anew" if here.reopens else ""
-        if note.code != code_digest():
+        if note.version != __version__:
             how += "; its code stays that of another version until the service is stopped"
         _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
         return RelayChild(pid=here.pid, link=link, door=bequest.door)
-
-    def _hello_to(self, note: Note, bequest: Bequest) -> RelayHello | str:
-        """How we greet the relay of the note, or why we do not: it has other words, and we would misunderstand it."""
-        words = bequest.door.words(note)
-        if words is None or words.digest == words_digest():
-            return self._hello
-        if reason := misunderstanding(words, own()):
-            return f"its words are another version's: {reason}"
-        self._its_words = words
-        return replace(self._hello, digest=self._digest(words.digest))
-
-    def _digest(self, words: str) -> str:
-        """Over all that a relay of these words must have been started with, for us to go on with it."""
-        daemons, python, local_config = self._kept
-        return digest_of(daemons, words, python, local_config)
-
-    def _outgrown(self, relay: RelayChild) -> RelayChild | None:
-        """The relay that follows one which cannot be told what there is to say."""
-        reason, self._lack = f"it does not know {self._lack}, which is needed now", ""
-        _log.warning("the relay that runs here (pid %d) is replaced: %s", relay.pid, reason)
-        self._on_report(RelayChanged(is_running=False, reason=reason))
-        door = None if self._bequest is None else self._bequest.door
-        return self._replaced(RelayChild(pid=relay.pid, link=None, door=door))
 
     def _replaced(self, other: RelayChild) -> RelayChild | None:
         """The relay that follows ``other``; ``None``: it could not be started yet.
@@ -352,7 +315,7 @@ class RelayHandle:
         try:
             reason = self._listen(relay)
         finally:
-            if not self._is_leaving and not self._lack:
+            if not self._is_leaving:
                 if not reason:  # it ends itself: its exit code says more than our SIGKILL's
                     relay.wait(ENDING_S)
                 relay.kill()
@@ -362,10 +325,9 @@ class RelayHandle:
         return reason or relay.ending
 
     def _start(self, ends_other: Callable[[RelayChild], None] = lambda _next: None) -> RelayChild:
-        self._its_words = None
         if self._bequest is None:
             return start_relay(self._command)
-        return start_relay(self._command, self._bequest.door, self._bequest.listen, code_digest(), ends_other)
+        return start_relay(self._command, self._bequest.door, self._bequest.listen, ends_other)
 
     def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
         too_large: dict[tuple[str, TaskId], str] = {}
@@ -375,10 +337,6 @@ class RelayHandle:
             for text in texts:
                 write_frame(relay.descriptor, text)
             while (value := outbox.take()) is not None:
-                if self._its_words is not None and (found := lack(value, self._its_words)):
-                    self._lack = found
-                    relay.hang_up()  # it carries on alone, as without a daemon, until the next one is ready
-                    return
                 kind = (type(value).__name__, value.task)
                 try:
                     frame = wire.encode(value)

@@ -187,7 +187,7 @@ class Executor:
         self._adopt_worker(before, todo, had_worker=kept_worker)
         if self.is_leased is not was_leased:
             self._change_terms(todo, now)
-        self._adopt_routes(before, todo)
+        self._adopt_routes(todo)
 
     def _adopt_worker(self, before: TaskSpec, todo: ToDo, *, had_worker: bool) -> None:
         worker, known = self.spec.worker, before.worker
@@ -202,11 +202,11 @@ class Executor:
         elif worker.command or known.command:
             todo.add(StopWorker(task=self.spec.name))
 
-    def _adopt_routes(self, before: TaskSpec, todo: ToDo) -> None:
+    def _adopt_routes(self, todo: ToDo) -> None:
         if self._current is None:
             return
         slot = slot_for(self.spec, self.me, self._current.owner, self._current.epoch)
-        if slot == self._current and self.spec.exclusive is before.exclusive:
+        if slot == self._current:
             return
         self._current = slot
         todo.add(ApplyRoutes(plan=self._plan(slot, self._plan_phase)))

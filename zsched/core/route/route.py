@@ -105,7 +105,6 @@ def plan_for(spec: TaskSpec, phase: RoutePhase, current: Slot, predecessors: tup
         phase=phase,
         current=current,
         predecessors=() if phase is RoutePhase.CLOSE else predecessors,
-        exclusive=spec.exclusive,
     )
 
 

@@ -164,8 +164,6 @@ class RoutePlan(Struct, frozen=True, kw_only=True):
     phase: RoutePhase
     current: Slot | None
     predecessors: tuple[Slot, ...] = ()
-    exclusive: bool = False
-    """The owner's outputs must not pass while this node could not hear of another owner."""
 
 
 class WorkerRole(StrEnum):

@@ -122,7 +122,6 @@ class OutputStream:
         """(until when, what feeds a slot that was cut)."""
         self._notes_stamps = False
         self._stamps: OrderedDict[Timestamp, None] = OrderedDict()
-        self._is_paused = False
         self._is_latest = route.settings.stream_class is StreamClass.LATEST
         max_hz = route.settings.max_hz
         self._pace: Pace[Sample] | None = None if max_hz is None else Pace(max_hz, remembers=self._is_latest)
@@ -258,27 +257,6 @@ class OutputStream:
             if self._carrier is None or (slot.held and self.route.settings.handover is HandoverRule.LATEST):
                 self._take_over(slot)
 
-    def pause(self) -> None:
-        """Let nothing through: it waits, bounded."""
-        with self._lock:
-            self._is_paused = True
-
-    def resume(self, epoch: int) -> None:
-        """End a pause; what came meanwhile goes on if ``epoch`` is still the newest, else it is dropped."""
-        with self._lock:
-            carrier = self._carrier
-            if not self._is_paused:
-                return
-            self._is_paused = False
-            if carrier is None:
-                self._promote()
-            elif carrier.epoch == epoch:
-                self._release(carrier)
-            else:
-                self._counter.dropped("stale_epoch", len(carrier.held))
-                carrier.held.clear()
-                carrier.held_bytes = 0
-
     def has_ended(self, epoch: int) -> bool:
         """True when everything of the slot has come (end markers), it was cut, or it is not there."""
         with self._lock:
@@ -306,11 +284,8 @@ class OutputStream:
             is_cut = self._is_cut(slot)
             if slot is self._carrier:  # of any other nothing more was wanted
                 self._counter.lost += slot.missing() + slot.take_lost() if feed is not None else 0
-                self._counter.dropped("stale_epoch", len(slot.held))  # of a pause
                 self._carrier = None
                 self._promote()
-            elif self._is_paused:
-                self._counter.dropped("stale_epoch", len(slot.held) if slot.is_flipped else 0)
             elif slot.is_flipped and slot.held:
                 self._keep_left(slot, is_cut=is_cut)
             if slot.answers is not None:
@@ -392,7 +367,7 @@ class OutputStream:
                 self._counter.lost += slot.take_lost() if slot is self._carrier else 0
                 for (name, zid, eid), sample in slot.answers.overdue() if slot.answers is not None else ():
                     self._pass(slot, slot.keys.setdefault(name, KeyState(name=name)), (zid, eid), sample)
-            if self._pace is None or not self._is_latest or self._is_paused:
+            if self._pace is None or not self._is_latest:
                 return
             for sample in self._pace.overdue(monotonic_s()):
                 self._note_passed(monotonic_s())
@@ -475,9 +450,7 @@ class OutputStream:
         key.reopen()
 
     def _gate(self, slot: OutputSlot, sample: Sample, size: int) -> None:
-        if self._is_paused:
-            self._hold(slot, sample)
-        elif slot is self._carrier:
+        if slot is self._carrier:
             self._forward(sample, size)
         elif self._is_cut(slot):
             self._counter.dropped("cut")
@@ -495,8 +468,6 @@ class OutputStream:
             self._counter.dropped("overflow")
 
     def _promote(self) -> None:
-        if self._is_paused:
-            return  # the end of the pause does it
         choose = min if self.route.settings.handover is HandoverRule.ALL else max  # with `ALL` each has its turn
         while flipped := [slot for slot in (*self._left, *self._slots.values()) if slot.is_flipped]:
             slot = choose(flipped, key=lambda slot: slot.epoch)
@@ -512,7 +483,7 @@ class OutputStream:
         self._release(slot)
 
     def _release(self, slot: OutputSlot) -> None:
-        while slot.held and not self._is_paused:
+        while slot.held:
             sample = slot.held.popleft()
             slot.held_bytes -= weight(sample)
             self._forward(sample)

@@ -629,46 +629,6 @@ def test_with_all_the_answers_of_an_owner_that_dies_before_its_turn_come_in_thei
     assert drops(move.stream) == {}
 
 
-@pytest.mark.parametrize("rule", list(HandoverRule))
-def test_nothing_goes_out_of_a_pause_because_the_old_slot_ends_or_the_next_one_is_flipped_to(
-    bench: Bench, rule: HandoverRule
-) -> None:
-    """The old owner drained while nobody here would have learnt of another one: what waited behind it went out."""
-    move = Handover(bench, rule)
-    move.put(move.old, "old 1")
-    move.put(move.new, "new 1")
-    move.stream.pause()
-    move.put(move.new, "new 2")
-    move.stream.flip(2, drops_held=False)
-    move.stream.close_slot(1)
-    move.put(move.new, "new 3")
-    assert len(move.stream._slots[2].held) == 3
-    assert move.is_through("old 1")
-    move.stream.resume(2)
-    assert move.is_through("old 1", "new 1", "new 2", "new 3")
-    assert drops(move.stream) == {}
-
-
-def test_what_waited_in_a_pause_for_an_owner_that_is_none_any_more_is_dropped_and_counted(bench: Bench) -> None:
-    """Two slots of it: the first one's end let the second one's answers pass."""
-    move = Handover(bench, HandoverRule.ALL)
-    move.put(move.old, "old 1")
-    move.stream.flip(2, drops_held=False)
-    move.put(move.new, "new 1")
-    move.stream.pause()
-    move.put(move.old, "old 2")
-    move.put(move.new, "new 2")
-    move.stream.open(3, way_out(3, HandoverRule.ALL))
-    newest = bench.publisher(way_out(3, HandoverRule.ALL).from_expr)
-    move.stream.close_slot(1)
-    move.stream.close_slot(2)
-    move.stream.resume(3)
-    move.stream.flip(3, drops_held=False)
-    move.put(newest, "newest 1")
-    assert move.is_through("old 1", "newest 1")
-    assert drops(move.stream) == {"stale_epoch": 3}
-
-
 def test_answers_of_owners_that_died_before_their_turn_are_bounded_and_counted(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -828,17 +788,6 @@ def test_an_old_owners_thinned_value_never_follows_the_new_owners(
     move.put(move.new, "4")
     until(lambda: move.got == ["1", "3", "4"], f"{move.got}")
     assert drops(move.stream) == {"thinned": 2}
-
-
-def test_a_thinned_value_waits_while_its_output_is_paused(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    move = Thinned(bench, monkeypatch)
-    move.put(move.old, "1")
-    move.put(move.old, "2")
-    move.stream.pause()
-    move.wait()
-    move.put(move.old, "3")
-    move.stream.resume(1)
-    until(lambda: move.got == ["1", "3"], f"{move.got}")
 
 
 def test_numbers_that_do_not_fit_are_counted_and_old_ones_dropped(bench: Bench) -> None:

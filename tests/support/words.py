@@ -1,13 +1,7 @@
-"""What a daemon and its relay say to each other, as a digest: whether a relay of other code can be gone on with.
-
-Knows: the classes that pass the pipe, and how a class is told field by field. Does not know: code, pipes, processes.
-
-A word that gets another meaning with the same fields is not seen here: `zsched.ipc.takeover.PROTOCOL` is raised for it.
-"""
+"""What a daemon and its relay say to each other, field by field, and a digest over it."""
 
 from __future__ import annotations
 
-import functools
 import types
 from collections.abc import Iterator
 from dataclasses import MISSING, fields, is_dataclass
@@ -22,7 +16,6 @@ from zsched.wire import codec as wire
 _GREETINGS: Final[tuple[type[Any], ...]] = (RelayHello, RelayHere, RelayRefused)
 
 
-@functools.cache
 def words_digest() -> str:
     """16 hex digits over every class that passes the pipe: fields, types, defaults, members, bounds."""
     state = blake2s(digest_size=8)
