@@ -67,6 +67,25 @@ def test_an_interrupt_while_the_daemon_loads_is_an_orderly_stop(tmp_path: Path) 
     assert "stopping node=robot1" in said
 
 
+def test_a_folder_of_our_name_in_the_current_one_is_not_taken_for_the_program(tmp_path: Path) -> None:
+    """In the parent of an editable clone neither daemon nor relay nor worker could be imported."""
+    bed = Testbed(tmp_path, echo_fleet(robots=1, edges=0))
+    bed.init()
+    (tmp_path / "zsched").mkdir()
+    command = [sys.executable, "-P", "-c", MAIN, "up", "--config", str(bed.file), "--node", "robot1"]
+    command += ["--state-dir", str(tmp_path / "robot1"), "--runtime-dir", str(tmp_path)]
+    process = subprocess.Popen(command, cwd=tmp_path)
+    try:
+        socket = tmp_path / "robot1.sock"
+        until(lambda: socket.exists() or process.poll() is not None, "the daemon's socket")
+        bed.wait(lambda: bed.task("robot1")["owner"] == "robot1", 60, "a worker that is ready")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+        process.wait(60)
+
+
 def test_up_on_a_machine_that_the_file_does_not_name_says_only_that(tmp_path: Path) -> None:
     bed = Testbed(tmp_path, echo_fleet(robots=1, edges=0))
     command = [

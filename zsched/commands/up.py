@@ -30,7 +30,7 @@ def become_daemon(
     name = own_name(node)
     state = places.state_folder(state_dir, os.environ)
     runtime = places.runtime_folder(runtime_dir, os.environ)
-    daemon = [sys.executable, "-m", "zsched.daemon", "--config", str(file), "--node", name]
+    daemon = [sys.executable, "-P", "-m", "zsched.daemon", "--config", str(file), "--node", name]
     daemon += ["--state-dir", str(state), "--runtime-dir", str(runtime), "--log-level", log_level]
     sys.stdout.flush()
     sys.stderr.flush()

@@ -114,7 +114,7 @@ class Nodes:
 
     def start(self, node: NodeId) -> IO[bytes]:
         """Start a daemon that does not run; its log, which is the caller's to read and to close."""
-        daemon = [sys.executable, "-m", "zsched.daemon", "--config", str(self.file), "--node", node]
+        daemon = [sys.executable, "-P", "-m", "zsched.daemon", "--config", str(self.file), "--node", node]
         daemon += ["--state-dir", str(self.folder / node), "--runtime-dir", str(self.folder)]
         process = self._spawn(daemon, node, stderr=subprocess.PIPE)
         assert process.stderr is not None

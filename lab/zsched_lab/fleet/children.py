@@ -60,7 +60,7 @@ class Janitor:
 
     def __init__(self, token: str) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "zsched_lab.fleet.janitor", token],
+            [sys.executable, "-P", "-m", "zsched_lab.fleet.janitor", token],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -99,8 +99,8 @@ class Children:
         self.left_behind: list[str] = []
 
     def environment(self) -> dict[str, str]:
-        """Ours, with the run's token and one thread per numeric library."""
-        return {**os.environ, **THREAD_LIMITS, TOKEN_VARIABLE: self.token}
+        """Ours, with the run's token and one thread per numeric library; no program is looked for in our folder."""
+        return {**os.environ, **THREAD_LIMITS, "PYTHONSAFEPATH": "1", TOKEN_VARIABLE: self.token}
 
     def start(self, name: str, command: list[str], *, output: Path | None = None) -> Child:
         """Start ``command`` as ``name``, bound to our life; stderr (and stdout, without ``output``) go to its log.

@@ -358,9 +358,13 @@ def _printable(line: bytes) -> str:
 
 
 def _own_python(command: Sequence[str]) -> tuple[str, ...]:
-    """The command with ``python`` replaced by this interpreter: workers find the daemon's packages."""
+    """The command with ``python`` replaced by this interpreter: workers find the daemon's packages.
+
+    Our own workers are not looked for in the current folder, which may hold another ``zsched``.
+    """
     if command and command[0] in {"python", "python3"}:
-        return (sys.executable, *command[1:])
+        is_ours = "-m" in command[1:2] and command[2].startswith("zsched.")
+        return (sys.executable, *(("-P",) if is_ours else ()), *command[1:])
     return tuple(command)
 
 

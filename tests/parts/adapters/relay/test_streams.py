@@ -196,7 +196,7 @@ RELAY = """#!{python}
 import os, runpy, sys, time
 sys.path[:0] = {path!r}
 {deed}
-sys.argv[1:3] = []
+sys.argv[1:4] = []
 runpy.run_module("zsched.relay", run_name="__main__", alter_sys=True)
 """
 SUSPENDED = """
