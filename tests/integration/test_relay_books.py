@@ -125,33 +125,6 @@ def test_what_a_relay_had_when_it_was_killed_is_at_most_lost(
     assert found.messages > told.messages, "the counters go on"
 
 
-def test_what_came_since_the_last_count_is_counted_after_a_kill(rig: Booked, app: Application) -> None:
-    """The owner hangs, so nothing of it is done: all that the relay has taken is at most lost, to the sample."""
-    until(app.connected, "the application sees the relay's subscription")
-    for _ in range(50):
-        app.put()
-    until(lambda: rig.input.acknowledged == 50, "all are done")
-    rig.workers["edge1"].send_signal(signal.SIGSTOP)
-    pid = pid_of(rig)
-    counted = rig.reports[ROBOT].count(RelayChanged)
-    until(lambda: rig.input.messages == 50 and rig.input.last_seen_s, "a count")
-    for _ in range(120):
-        app.put()
-    until(lambda: cell_of(rig.folder) == 170, "the relay has taken them", 5.0)
-    os.kill(pid, signal.SIGKILL)
-    until(lambda: rig.reports[ROBOT].count(RelayChanged) == counted + 2, "the relay runs again")
-    until(lambda: rig.input.messages >= 170, "the next one counts on")
-    assert (rig.input.messages, rig.input.at_most_lost) == (170, 120)
-    rig.workers["edge1"].send_signal(signal.SIGCONT)
-
-
-def cell_of(folder: Path) -> int:
-    """How many samples the input has taken, as the kernel has it."""
-    content = (folder / f"{ROBOT}.relay.taken").read_bytes()
-    at = content.index(IN.encode())
-    return int.from_bytes(content[at + 120 : at + 128], "little")
-
-
 def test_a_relay_that_is_replaced_in_order_leaves_exact_books(rig: Booked, app: Application) -> None:
     """The next daemon cannot go on with it: it lets arrive what is under way, and loses nothing that it has taken."""
     thread = app.flow(200, 200)

@@ -157,24 +157,14 @@ class Door:
 
     def remove(self) -> None:
         """Remove the files, once the relay is gone."""
-        for path in (self._socket, self._next, *books_files(self.books), self._lock):
+        for path in (self._socket, self._next, self.books, fresh_file(self.books), self._lock):
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
-
-
-def taken_file(books: Path) -> Path:
-    """Beside a relay's books: how many samples each input has taken."""
-    return books.with_suffix(".taken")
 
 
 def fresh_file(path: Path) -> Path:
     """What takes the place of a file once it is whole."""
     return path.with_name(f"{path.name}.next")
-
-
-def books_files(books: Path) -> tuple[Path, ...]:
-    """All files that may stand there for a relay's books."""
-    return tuple(one for made in (books, taken_file(books)) for one in (made, fresh_file(made)))
 
 
 def relays_in(folder: Path) -> tuple[int, ...]:

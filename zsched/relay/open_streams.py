@@ -19,27 +19,17 @@ from zsched.relay.streams.inputs import InputStream, KeptValues
 from zsched.relay.streams.outputs import OutputStream
 
 _Stream = TypeVar("_Stream", InputStream, OutputStream)
-Cells = Callable[[str], memoryview | None]
-"""Where an input counts what it takes, by its name, beside its own counters (`zsched.relay.books`)."""
 
 
 class OpenStreams:
     """Changed by the task's thread alone; `counts` and `under_way` may be read by any."""
 
-    def __init__(
-        self,
-        session: Session,
-        own_ids: frozenset[str],
-        local: Session | None = None,
-        cells: Cells = lambda _stream: None,
-        leave_cell: Callable[[str], None] = lambda _stream: None,
-    ) -> None:
+    def __init__(self, session: Session, own_ids: frozenset[str], local: Session | None = None) -> None:
         """``session`` is the fleet's, ``local`` the one of the host's own side, if it has one.
 
-        ``own_ids`` are those of all sessions of this process; ``leave_cell`` hears that an input counts no more.
+        ``own_ids`` are those of all sessions of this process.
         """
         self._session, self._local, self._own_ids = session, local, own_ids
-        self._cells, self._leave_cell = cells, leave_cell
         self._times = AnswerTimes()
         self.wake: Callable[[], None] = lambda: None
         """Called, in any thread, when the end of an output has come."""
@@ -123,14 +113,10 @@ class OpenStreams:
         return any(stream.route.settings.stream_class is not StreamClass.BEST_EFFORT for stream in self.all())
 
     def _take_input(self, route: Route) -> InputStream:
-        cell = self._cells(route.stream)
-        if cell is not None:
-            before = self._closed.get(route.stream)
-            cell[0] = 0 if before is None else before.messages
         kept = self._kept(route)
         self._late.discard(route.from_expr)
         try:
-            return InputStream(self._session, route, self._own_ids, self._local, self._times, cell=cell, kept=kept)
+            return InputStream(self._session, route, self._own_ids, self._local, self._times, kept=kept)
         except RuntimeError:
             self._late.add(route.from_expr)
             self._left[route.from_expr] = kept
@@ -163,6 +149,3 @@ class OpenStreams:
             return
         if kept := one.kept():
             self._left[one.route.from_expr] = kept
-        if (cell := self._cells(stream)) is not None:
-            cell[0] = 0  # the books tell nothing of it from now on, so nothing of it is untold
-            self._leave_cell(stream)

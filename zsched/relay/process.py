@@ -401,7 +401,7 @@ class RelayProcess:
                 self._acks,
                 self._application.report,
                 graph,
-                OpenStreams(self._session, self._own_ids, self._local, self._books.cell, self._books.leave),
+                OpenStreams(self._session, self._own_ids, self._local),
                 self._local,
             )
             self._tasks[name] = task
@@ -446,7 +446,7 @@ class RelayProcess:
     def _tell_counts(self, *, is_last: bool = False) -> None:
         own = self._application.apart(self._own_counts())
         counts = self._books.added(own)
-        self._books.write(own, self._application.settled(own), is_last=is_last)
+        self._books.write(self._application.settled(own), is_last=is_last)
         self._reporter.report(StreamsCounted(counts=self._application.added(counts)))
 
 

@@ -13,7 +13,7 @@ INPUTS, SHARED = "zsched.worker.inputs", "zsched.core.hop.shared"
 KEPT, HELD, SLOTS = "zsched.core.hop.kept", "zsched.core.hop.held", "zsched.relay.streams.slots"
 GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
 
-BOOKS, TASK = "zsched.relay.books", "zsched.relay.task"
+TASK = "zsched.relay.task"
 
 _BOOKS = ("tests/unit/relay/test_books.py",)
 _TASK = ("tests/parts/relay/test_task.py",)
@@ -547,21 +547,7 @@ STREAM_BUGS = (
     _bug(
         "what a relay had in its hand goes with it",
         "zsched.core.hop.books",
-        "        at_most_lost=count.at_most_lost + in_hand,\n",
-        "",
-        _BOOKS,
-    ),
-    _bug(
-        "what a killed relay took since its last count is in no counter",
-        BOOKS,
-        "closed(count, untold.get(stream, 0))",
-        "closed(count)",
-        _BOOKS,
-    ),
-    _bug(
-        "the cells of another life are counted once more",
-        BOOKS,
-        "            if life == found.life  # else no cells had been made yet\n",
+        "        at_most_lost=count.at_most_lost + (count.in_flight or 0),\n",
         "",
         _BOOKS,
     ),

@@ -46,16 +46,14 @@ def given_up(count: StreamCount) -> int:
     return count.lost + count.at_most_lost + sum(number for _, number in count.drops)
 
 
-def closed(count: StreamCount, untold: int = 0) -> StreamCount:
-    """What stays of the counters of somebody who has gone; ``untold`` samples it had taken since it told them.
+def closed(count: StreamCount) -> StreamCount:
+    """What stays of the counters of somebody who has gone.
 
-    What was in flight may be done or not, and so may the untold ones; nothing is in flight any more, and nothing moves.
+    What was in flight may be done or not; nothing is in flight any more, and nothing moves.
     """
-    in_hand = (count.in_flight or 0) + (0 if count.in_flight is None else untold)
     return replace(
         count,
-        messages=count.messages + untold,
-        at_most_lost=count.at_most_lost + in_hand,
+        at_most_lost=count.at_most_lost + (count.in_flight or 0),
         in_flight=None if count.in_flight is None else 0,
         last_seen_s=None,
         answer_s=None,

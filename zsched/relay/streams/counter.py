@@ -23,10 +23,8 @@ class _Answers:
 class StreamCounter:
     """Counters of one stream since it was opened."""
 
-    def __init__(self, stream: str, cell: memoryview | None = None) -> None:
-        """``cell``: one number that outlives this process, of all samples that came in."""
+    def __init__(self, stream: str) -> None:
         self.stream = stream
-        self._cell = cell
         self._messages = 0
         self._bytes = 0
         self._drops: dict[str, int] = {}
@@ -49,8 +47,6 @@ class StreamCounter:
     def seen(self, size: int) -> None:
         """A sample of ``size`` bytes came in."""
         self._messages += 1
-        if self._cell is not None:
-            self._cell[0] += 1
         self._bytes += size
         self._last_seen = monotonic_s()
 

@@ -90,20 +90,19 @@ class InputStream:
         times: AnswerTimes | None = None,
         *,
         is_ours: bool = False,
-        cell: memoryview | None = None,
         kept: KeptValues = (),
     ) -> None:
         """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
 
-        ``is_ours``: nothing is subscribed to, samples come by `give`. ``cell``: see `StreamCounter`. ``kept``: values
-        of these keys that came before, in order.
+        ``is_ours``: nothing is subscribed to, samples come by `give`. ``kept``: values of these keys that came
+        before, in order.
         """
         self.route = route
         self._times = times
         self._session = session
         side = self._clock = local or session  # the fleet's may be closed for a moment
         self._lock = threading.Lock()
-        self._counter = StreamCounter(route.stream, cell)
+        self._counter = StreamCounter(route.stream)
         self._slots: dict[int, _InputSlot] = {}
         self._active: _InputSlot | None = None
         self._mirror: _InputSlot | None = None
