@@ -141,7 +141,8 @@ def change(door: Door, what: Json) -> Json:
     if outcome in ("ok", "unchanged"):
         return answer
     advice = ADVICE.get(outcome, "")
-    words = f"{outcome.replace('_', ' ')}: {detail}{'; ' if advice else ''}{advice}"
+    word = "" if outcome == "no_quorum" else f"{outcome}: "
+    words = f"{word}{detail}{'; ' if advice else ''}{advice}"
     kind = ConflictError if outcome == "conflict" else CliError
     raise kind(CODES.get(outcome, EXIT_FAILED), words)
 

@@ -205,7 +205,8 @@ def show_rows(titles: Row, rows: Sequence[Row]) -> None:
 def refused(task: str, result: Json) -> CliError:
     """The error that tells of an order that was not agreed."""
     outcome, detail = str(result["outcome"]), str(result["detail"]).removeprefix(f"{task}: ")
-    text = f"{task}: {outcome.replace('_', ' ')}: {detail}{ADVICE.get(outcome, '')}"
+    word = "" if outcome == "no_quorum" else f"{outcome}: "  # that one is told by its detail: who did not answer
+    text = f"{task}: {word}{detail}{ADVICE.get(outcome, '')}"
     return CliError(CODES.get(outcome, EXIT_FAILED), text)
 
 
