@@ -63,7 +63,11 @@ class RosNode:
     def advertise(self, topic: str) -> Callable[[bytes], bytes]:
         """A latched publisher; the function publishes and answers the attachment."""
         publisher = ext.declare_advanced_publisher(
-            self.session, f"0/{topic}/{GRID}", cache=ext.CacheConfig(1), publisher_detection=True
+            self.session,
+            f"0/{topic}/{GRID}",
+            cache=ext.CacheConfig(1),
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            publisher_detection=True,
         )
         self.entities.append(publisher)
         self.announce("MP", topic)
@@ -168,6 +172,26 @@ def test_latched_topics_and_their_attachments_through_a_move(rig: Rig) -> None:
     late.subscribe("merged_map")
     until(lambda: (b"merged by edge2", second) in of(late), "the newest result for who comes late")
     assert decode_attachment(second) is not None
+
+
+def test_each_publisher_of_a_latched_topic_is_heard_through_a_move(rig: Rig) -> None:
+    """As /tf_static of three drivers: a new owner heard one of three, for ever."""
+    sent = [(text, rig.on_robot().advertise("map")(text)) for text in (b"1", b"2", b"3")]
+    workers = {"edge1": rig.on_edge(), "edge2": rig.on_edge()}
+    for owner, worker in workers.items():
+        worker.subscribe(f"{owner}/merge/robot1/map")
+        worker.serve(f"{owner}/merge/now", b"")
+    for number, (owner, worker) in enumerate(workers.items()):
+        beside = [rig.on_edge() for _ in range(2 - number)]
+        said = [node.advertise(f"{owner}/merge/map") for node in (worker, *beside)]
+        rig.move(owner)
+        until(lambda worker=worker: sorted(set(of(worker))) == sent, "all three at the owner")  # type: ignore[misc]
+        early, late = rig.on_robot(), rig.on_robot()
+        early.subscribe("merged_map")
+        answers = sorted((text, say(text)) for say, text in zip(said, (b"a", b"b", b"c"), strict=False))
+        until(lambda early=early, answers=answers: set(of(early)) >= set(answers), "they reach the robot")  # type: ignore[misc]
+        late.subscribe("merged_map")
+        until(lambda late=late, answers=answers: sorted(of(late)) == answers, "those of this owner for who comes late")  # type: ignore[misc]
 
 
 def test_graph_tools_see_the_endpoints_of_the_other_side(rig: Rig) -> None:

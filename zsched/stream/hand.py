@@ -55,7 +55,9 @@ class Hand:
         """The application's key of an answer (``""``: it does not fit)."""
         return self._rewriting.key(str(sample.key_expr)) or "" if self._rewriting.is_wild else self._to
 
-    def send(self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None) -> tuple[str, int]:
+    def send(
+        self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None, place: int = 0
+    ) -> tuple[str, int]:
         """Queue one answer; answers (why something was dropped, how much of it)."""
         key = self.key_of(sample)
         if not key:
@@ -69,7 +71,10 @@ class Hand:
             deleted=sample.kind == SampleKind.DELETE,
         )
         size = weight(sample) if size is None else size
-        return "overflow", self._queue.send(key, partial(self._deliver, received), size)
+        return "overflow", self._queue.send((key, place), partial(self._deliver, received), size)
+
+    def keep_first(self) -> None:
+        """Nothing is kept."""
 
     @property
     def is_empty(self) -> bool:

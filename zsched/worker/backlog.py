@@ -105,8 +105,8 @@ class StandbyInputs(Generic[SourceT]):
     """Samples that are *kept* until the worker becomes the owner, and samples that are to be processed *again*."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[int, str], deque[Done[SourceT]]] = {}
-        """{input and key: what is kept of it, never nothing}, the key that was heard last at the end."""
+        self._kept: dict[tuple[int, SourceName | str], deque[Done[SourceT]]] = {}
+        """{input and publisher: what is kept of it, never nothing}, the one that was heard last at the end."""
         self._bytes = 0
         self._again: deque[Done[SourceT]] = deque()
 
@@ -127,7 +127,7 @@ class StandbyInputs(Generic[SourceT]):
     def keep(self, done: Done[SourceT]) -> list[Done[SourceT]]:
         """Keep a sample; answers those that gave way to it unanswered, and are lost."""
         source = done.source
-        name = id(source), str(done.sample.key_expr)
+        name = id(source), done.name or str(done.sample.key_expr)
         line = self._kept.pop(name, deque())
         self._kept[name] = line
         line.append(done)
@@ -141,7 +141,7 @@ class StandbyInputs(Generic[SourceT]):
             given_up += self._make_room(name)
         return [one for one in given_up if one.is_lost]
 
-    def _make_room(self, newest: tuple[int, str]) -> list[Done[SourceT]]:
+    def _make_room(self, newest: tuple[int, SourceName | str]) -> list[Done[SourceT]]:
         """Let go of keys; answers what was kept of them."""
         others = [name for name in self._kept if name != newest]
         others.sort(key=lambda name: any(done.quiet_at is None for done in self._kept[name]))

@@ -139,10 +139,11 @@ class Dispatcher:
                 return
             waiting.number = number
             waiting.replayed = number < self._acks.replay_end(waiting.name)
+        waiting.line = waiting.name or key
         with self._wake:
             self._came_at = monotonic_s()
             self._timer.waiting += 1
-            line = source.waiting.setdefault(key, deque())
+            line = source.waiting.setdefault(waiting.line, deque())
             line.append(waiting)
             limit = source.newest(is_whole=waiting.is_whole) or source.depth
             while len(line) > limit:  # more than one where its class was told wrongly
@@ -159,9 +160,8 @@ class Dispatcher:
         if oldest.sample is None:
             self._dead -= 1
             return
-        key = str(oldest.sample.key_expr)
-        oldest.source.take_out(key, oldest)
-        self._lose(oldest.source, oldest, is_newest=key not in oldest.source.waiting)
+        oldest.source.take_out(oldest)
+        self._lose(oldest.source, oldest, is_newest=oldest.line not in oldest.source.waiting)
 
     def _shed(self, source: Input, oldest: Waiting) -> None:
         self._lose(source, oldest)
@@ -224,7 +224,7 @@ class Dispatcher:
                 self._given_up.pop(next(iter(self._given_up)))
             waiting = [one for one in self._queue if one.name == name and one.sample is not None]
             for one in waiting:
-                one.source.take_out(name[0], one)
+                one.source.take_out(one)
                 one.sample = None
             self._timer.waiting -= len(waiting)
             self._note_dead(len(waiting))
@@ -409,7 +409,7 @@ class Dispatcher:
         if waiting.sample is None:
             self._dead -= 1
             return None
-        waiting.source.take_out(str(waiting.sample.key_expr), waiting)
+        waiting.source.take_out(waiting)
         self._timer.waiting -= 1
         self._timer.least = min(self._timer.least, self._timer.waiting)
         return waiting

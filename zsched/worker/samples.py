@@ -21,6 +21,9 @@ from zsched.worker.backlog import Done
 BY_CLASS: Final = "by_class"
 """``keep_last`` where the worker's author names none: of a source of class ``reliable`` all samples wait, of any other
 one the newest."""
+Line = SourceName | str
+"""Whose newest samples are kept: a publisher's of a key (its relay sends what each of several put by another one), or
+all of those of a key that give no numbers."""
 KeepLast = int | Literal["by_class"] | None
 
 
@@ -50,8 +53,8 @@ class Input(Struct, eq=False):
     on_sample: Callable[[Received], None]
     keep_last: KeepLast = BY_CLASS
     depth: int = 4096
-    waiting: dict[str, deque[Waiting]] = field(default_factory=dict)
-    """{key of which something waits: its samples, the oldest first}."""
+    waiting: dict[Line, deque[Waiting]] = field(default_factory=dict)
+    """{line of which something waits: its samples, the oldest first}."""
     shed: int = 0
     """Samples that gave way to newer ones."""
 
@@ -68,12 +71,12 @@ class Input(Struct, eq=False):
             return None if is_whole else 1
         return self.keep_last
 
-    def take_out(self, key: str, one: Waiting) -> None:
+    def take_out(self, one: Waiting) -> None:
         """A sample waits no more; a wildcard input hears any number of keys, so none stays of which nothing waits."""
-        line = self.waiting[key]
+        line = self.waiting[one.line]
         line.remove(one)
         if not line:
-            del self.waiting[key]
+            del self.waiting[one.line]
 
     def wants(self, *, is_whole: bool) -> bool:
         """Whether a sample that gives way to a newer one is lost."""
@@ -85,6 +88,7 @@ class Waiting(Struct, eq=False):
 
     source: Input
     sample: zenoh.Sample | None
+    line: Line = ""
     name: SourceName | None = None
     number: int = 0
     replayed: bool = False

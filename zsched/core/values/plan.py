@@ -64,7 +64,9 @@ class StreamSettings:
     """How one stream is carried."""
 
     stream_class: StreamClass = key(StreamClass.BEST_EFFORT, "What the stream needs.", name="class")
-    keep_last: int = key(1, "Samples per key that a new owner gets at once (class `latest`).", Range(0, 1000))
+    keep_last: int = key(
+        1, "Samples per key and publisher that a new owner gets at once (class `latest`).", Range(0, 1000)
+    )
     depth: int = key(16, "Samples that may wait between subscriber and publisher.", Range(1, 100_000))
     handover: HandoverRule = key(
         HandoverRule.LATEST, "Outputs: switch at the new owner's first sample, or lose nothing."

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.relay.streams.lanes import Lane
@@ -74,7 +74,7 @@ class Greetings:
         self._is_parted = is_parted
         self._is_away = True
 
-    def is_there(self, lanes: dict[tuple[str, str], Lane], *, is_matching: bool) -> bool:
+    def is_there(self, lanes: Mapping[Any, Lane], *, is_matching: bool) -> bool:
         """Whether there is somebody to greet; a worker that was away is greeted again."""
         if not is_matching or self._is_parted:
             self._is_away = True

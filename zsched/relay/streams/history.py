@@ -23,7 +23,8 @@ from zenoh import Sample, SampleKind, Session
 from zsched.clock import monotonic_s
 from zsched.core.hop.serial import number_near
 from zsched.guard import guarded, tolerant
-from zsched.relay.streams.questions import ADVANCED, Publisher, Question, Questions
+from zsched.relay.streams.places import PublisherId
+from zsched.relay.streams.questions import ADVANCED, Publisher, Question, Questions, publisher_of
 
 TIMEOUT_S: Final = 0.5
 MAX_FETCHES: Final = 8
@@ -50,8 +51,10 @@ class HeldValues:
         depth: int,
         deliver: Callable[[Sample], None],
         origin: zenoh.Locality = zenoh.Locality.REMOTE,
+        *,
+        asks: bool = True,
     ) -> None:
-        """Watch for publishers; `start` begins to ask.
+        """Watch for publishers; `start` begins to ask, unless they are only watched (``asks``).
 
         Raises:
             zenoh.ZError: ``expr`` is no key expression.
@@ -61,6 +64,9 @@ class HeldValues:
         self._depth = max(1, depth)
         self._deliver = deliver
         self._origin = origin
+        self._asks = asks
+        self._there: dict[PublisherId, bool] = {}
+        """Whose token has been seen, and whether it still is there."""
         self._own_id = str(session.zid())
         self._questions = Questions(expr, self._depth)
         self._asking = threading.Condition()
@@ -83,8 +89,9 @@ class HeldValues:
         """
         watch = f"{self._expr}/{ADVANCED}/pub/**"
         with self._asking:
-            self._questions.ask_all(monotonic_s())
-            self._have_asked()
+            if self._asks:
+                self._questions.ask_all(monotonic_s())
+                self._have_asked()
         self._tokens = self._session.liveliness().declare_subscriber(
             watch, tolerant(self._token, "history"), history=True
         )
@@ -96,6 +103,10 @@ class HeldValues:
             self._asking.notify_all()
         if self._tokens is not None:
             self._tokens.undeclare()
+
+    def is_there(self, publisher: PublisherId) -> bool | None:
+        """Whether a publisher shows its token; ``None``: it never has."""
+        return self._there.get(publisher)
 
     def live(self, sample: Sample) -> None:
         """A sample came the usual way: deliver it, unless the cache has brought it already."""
@@ -133,10 +144,16 @@ class HeldValues:
     def _token(self, sample: Sample) -> None:
         """A publisher with a cache came or went (zenoh's callback thread: start a thread, nothing else)."""
         key = str(sample.key_expr)
-        if self._own_id in key.split("/"):
+        is_there = sample.kind == SampleKind.PUT
+        _, session, number = publisher_of(key)
+        if number.isdecimal():  # else its samples have no numbers, and do not tell whose they are
+            self._there[session, int(number)] = is_there
+            if len(self._there) > MAX_SOURCES:
+                self._there.pop(next(iter(self._there)))
+        if not self._asks or self._own_id in key.split("/"):
             return
         with self._asking:
-            if sample.kind == SampleKind.PUT:
+            if is_there:
                 self._questions.appeared(key, monotonic_s())
                 self._have_asked()
             else:

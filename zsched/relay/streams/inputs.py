@@ -31,13 +31,14 @@ from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.outlet import MAX_OWED, QUEUE_DEPTH, Outlet, Unsent
 from zsched.relay.streams.pace import Pace
+from zsched.relay.streams.places import Places, PublisherId
 from zsched.relay.streams.proofs import LeftOpen, Stamps, unproven
 from zsched.relay.streams.receive import Receiver
 from zsched.relay.streams.tally import Tally
 from zsched.sessions.send_queue import MAX_BYTES
 
 MAX_KEYS: Final = 4096
-"""Concrete keys of one wildcard stream whose values are kept; the oldest give way."""
+"""Lines of one stream whose values are kept; the oldest give way."""
 
 HOLD_S: Final = 1.0
 """An owner that was left may take this long to end its slot; nobody waits for one that hangs."""
@@ -46,9 +47,12 @@ MAX_PAUSED: Final = QUEUE_DEPTH
 MAX_HELD: Final = MAX_OWED // 2
 """More samples than that are not held either: the next owner's queue has to take them."""
 
+_Line = tuple[str, int]
+"""(key, place of the publisher): what class ``latest`` keeps the newest values of."""
+_NO_LINE: Final[_Line] = ("", 0)
 _Kept = tuple[int, Sample, Timestamp]
 KeptValues = Sequence[tuple[Sample, Timestamp]]
-"""The newest values of each key of class ``latest``, with their timestamps, in the order in which they came."""
+"""The newest values of each line, with their timestamps, in the order in which they came."""
 
 
 def _never(_stamp: Timestamp) -> bool:
@@ -108,7 +112,7 @@ class InputStream:
         self._mirror: _InputSlot | None = None
         is_latest = route.settings.stream_class is StreamClass.LATEST
         max_hz = route.settings.max_hz
-        self._pace: Pace[tuple[Sample, Timestamp | None]] | None = (
+        self._pace: Pace[tuple[Sample, Timestamp | None, int]] | None = (
             None if max_hz is None else Pace(max_hz, remembers=is_latest)
         )
         self._replays = route.settings.on_crash is OnCrash.REPLAY
@@ -129,10 +133,12 @@ class InputStream:
         self._is_patient = route.settings.stream_class is StreamClass.RELIABLE
         self._number = 0
         self._keep_last = route.settings.keep_last if is_latest else 0
-        self._kept: OrderedDict[str, deque[_Kept]] = OrderedDict()
+        self._kept: OrderedDict[_Line, deque[_Kept]] = OrderedDict()
+        self._receiver: Receiver | None = None
+        self._places = Places(self._is_there)
         for sample, stamp in kept if self._keep_last else ():
             self._number += 1
-            self._keep(sample, stamp)
+            self._keep(self._line(sample), sample, stamp)
         self._closed = Tally()  # what slots that are closed have counted
         self._is_counted = False
         """Some worker has acknowledged what it has processed, or will."""
@@ -143,7 +149,7 @@ class InputStream:
         """Where the sample that is given goes, if its put is left to the giver (`_giving` and our lock guard it)."""
         self._has_end = self._is_late = False
         """The end marker is on its way, or we are closed; what is given comes behind that (guarded likewise)."""
-        self._receiver: Receiver | None = None if is_ours else self._subscribe(side)
+        self._receiver = None if is_ours else self._subscribe(side)
         self._ending: Receiver | None = None
         """It has unsubscribed, and may still have samples in hand: a full queue holds them up."""
 
@@ -520,9 +526,9 @@ class InputStream:
     def _send_passed_over(self, now: float) -> None:
         """Send the newest values that the rate has held back till now (under the lock)."""
         if self._pace is not None and self._keep_last and self._active is not None:
-            for sample, stamp in self._pace.overdue(now):
+            for sample, stamp, place in self._pace.overdue(now):
                 self._counter.repeated += 1  # it has been counted as thinned
-                self._send(sample, stamp)
+                self._send(sample, stamp, place=place)
 
     def count(self) -> StreamCount:
         """The counters now."""
@@ -549,14 +555,15 @@ class InputStream:
                 self._counter.dropped("loop")
                 return
             self._number += 1
-            stamp = self._keep(sample, sample.timestamp) if self._keep_last else self._stamp(sample)
+            pace = self._pace
+            line = self._line(sample) if self._keep_last or pace is not None else _NO_LINE
+            stamp = self._keep(line, sample, sample.timestamp) if self._keep_last else self._stamp(sample)
             if self._stamps is not None and (known := stamp or sample.timestamp) is not None:
                 self._stamps.note(known)
-            pace = self._pace
-            if pace is not None and not pace.passes(str(sample.key_expr), (sample, stamp), monotonic_s()):
+            if pace is not None and not pace.passes(line, (sample, stamp, line[1]), monotonic_s()):
                 self._counter.dropped("thinned")
             elif not self._is_paused:
-                self._route_on(sample, stamp, size, is_given=is_given)
+                self._route_on(sample, stamp, size, place=line[1], is_given=is_given)
             elif self._keep_last:
                 self._counter.unsent += 1
             elif len(self._paused) < MAX_PAUSED and self._paused_bytes + size <= MAX_BYTES // 2:
@@ -565,10 +572,18 @@ class InputStream:
             else:
                 self._counter.dropped("overflow")
 
-    def _route_on(self, sample: Sample, stamp: Timestamp | None, size: int, *, is_given: bool = False) -> None:
+    def _is_there(self, publisher: PublisherId) -> bool | None:
+        return None if self._receiver is None else self._receiver.is_there(publisher)
+
+    def _line(self, sample: Sample) -> _Line:
+        return str(sample.key_expr), self._places.of(sample) if self._keep_last else 0
+
+    def _route_on(
+        self, sample: Sample, stamp: Timestamp | None, size: int, *, place: int = 0, is_given: bool = False
+    ) -> None:
         if self._active is not None:
             self._active.sent = self._number
-            self._send(sample, stamp, size, is_given=is_given)
+            self._send(sample, stamp, size, place=place, is_given=is_given)
         elif self._next is not None:
             self._held.append((sample, stamp))
             self._held_bytes += size
@@ -588,18 +603,24 @@ class InputStream:
             self._counter.dropped("overflow")
 
     def _send(
-        self, sample: Sample, stamp: Timestamp | None, size: int | None = None, *, is_given: bool = False
+        self,
+        sample: Sample,
+        stamp: Timestamp | None,
+        size: int | None = None,
+        *,
+        place: int = 0,
+        is_given: bool = False,
     ) -> None:
         if self._active is not None:
             if self._times is not None:
                 self._times.sent(stamp or sample.timestamp)
             if not is_given or not self._claim(self._active.outlet, sample, stamp):
-                reason, dropped = self._active.outlet.send(sample, stamp, size)
+                reason, dropped = self._active.outlet.send(sample, stamp, size, place)
                 if dropped:
                     self._counter.dropped(reason, dropped)
         if self._mirror is not None:
             self._counter.repeated += 1
-            self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size))
+            self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size, place))
 
     def _claim(self, outlet: Outlet, sample: Sample, stamp: Timestamp | None) -> bool:
         self._in_hand = outlet  # first: Ctrl-C may come in between
@@ -612,29 +633,30 @@ class InputStream:
         """With `OnCrash.REPLAY` every sample has a timestamp, by which its answers are known."""
         return sample.timestamp or self._clock.new_timestamp() if self._replays else None
 
-    def _keep(self, sample: Sample, stamp: Timestamp | None) -> Timestamp:
+    def _keep(self, line: _Line, sample: Sample, stamp: Timestamp | None) -> Timestamp:
         """Keep a value, with a timestamp of ours where it has none: outputs made of it inherit that, for the gate."""
         stamp = stamp or self._clock.new_timestamp()
-        key = str(sample.key_expr)
-        values = self._kept.get(key)
+        values = self._kept.get(line)
         if values is None:
-            values = self._kept[key] = deque(maxlen=self._keep_last)
+            values = self._kept[line] = deque(maxlen=self._keep_last)
             if len(self._kept) > MAX_KEYS:
                 self._kept.popitem(last=False)
         else:
-            self._kept.move_to_end(key)  # who gives way is who has rested longest
+            self._kept.move_to_end(line)  # who gives way is who has rested longest
         values.append((self._number, sample, stamp))
         return stamp
 
     def _catch_up(self, slot: _InputSlot) -> int:
-        lines = self._kept.values()
-        owed = {kept[0]: kept for values in lines for kept in values if kept[0] > slot.sent}
-        if slot.lacks_newest:
-            owed |= {values[-1][0]: values[-1] for values in lines}
-        for _, (_, sample, stamp) in sorted(owed.items()):
+        owed = [
+            (kept, place)
+            for (_, place), values in self._kept.items()
+            for kept in values
+            if kept[0] > slot.sent or (slot.lacks_newest and kept is values[-1])
+        ]
+        for (_, sample, stamp), place in sorted(owed, key=lambda one: one[0][0]):
             if self._times is not None:
                 self._times.sent(stamp)
-            self._counter.dropped(*slot.outlet.send(sample, stamp))
+            self._counter.dropped(*slot.outlet.send(sample, stamp, place=place))
         slot.sent, slot.lacks_newest = self._number, False
         self._counter.replayed += len(owed)
         self._counter.repeated += len(owed)

@@ -112,7 +112,8 @@ class Outlet:
         self._to = to_expr
         self._epoch = epoch
         self._lock = threading.Lock()
-        self._lanes: dict[tuple[str, str], Lane] = {}
+        self._lanes: dict[tuple[str, str, int], Lane] = {}
+        """By key, how it is put, and place of the publisher (`Places`)."""
         self._full: dict[int, Lane] = {}
         """By entity id, lanes that were full when they were last put to or heard of (our lock)..."""
         self._due: dict[int, Lane] = {}
@@ -195,12 +196,15 @@ class Outlet:
         """
         self._rewriting.also_from(from_expr)
 
-    def send(self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None) -> tuple[str, int]:
+    def send(
+        self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None, place: int = 0
+    ) -> tuple[str, int]:
         """Put one sample; answers (why something was dropped, how much of it), with 0 when nothing was.
 
-        ``stamp`` stands in for the timestamp that the sample lacks; ``size`` is its `weight`, where it is known.
+        ``stamp`` stands in for the timestamp that the sample lacks; ``size`` is its `weight`, where it is known;
+        ``place`` that of its publisher: of class ``latest`` each goes on by a publisher, with a cache, of its own.
         """
-        lane = self._lane(sample)
+        lane = self._lane(sample, place)
         if lane is None:
             return ("no_key" if len(self._lanes) < MAX_LANES else "too_many_keys"), 1
         stamp = sample.timestamp or stamp
@@ -386,14 +390,14 @@ class Outlet:
 
     # --- lanes -------------------------------------------------------------------------------------------------------
 
-    def _lane(self, sample: Sample) -> Lane | None:
+    def _lane(self, sample: Sample, place: int = 0) -> Lane | None:
         priority, is_express = sample.priority, sample.express
-        if self._main is not None and not is_express and priority == _DATA:
+        if self._main is not None and not is_express and priority == _DATA and not place:
             return self._main
         key = self._rewriting.key(str(sample.key_expr))
         if key is None:
             return None
-        name = (key, f"{priority}{is_express}")
+        name = (key, f"{priority}{is_express}", place)
         lane, now = self._lanes.get(name), monotonic_s()
         if lane is None:
             if len(self._lanes) >= MAX_LANES - MAX_LANES // ROOM_SHARE and now >= self._room_at:
@@ -401,7 +405,7 @@ class Outlet:
                 self._make_room(now)
             if len(self._lanes) >= MAX_LANES:
                 return None
-            lane = self._declare(key, priority, is_express=is_express)
+            lane = self._declare(key, priority, is_express=is_express, place=place)
             if self._queue is not None and self._greetings is None and self._acks is not None:
                 self._queue.then(lambda: self._put_names((lane,)))
         lane.used_at = now
@@ -416,19 +420,29 @@ class Outlet:
         if self._queue is not None and not self._queue.is_empty:
             return
         with self._lock:
-            named = {id(lane): name for name, lane in self._lanes.items() if self._may_leave(lane, now)}
-            at_rest = [lane for lane in self._lanes.values() if id(lane) in named]
-            at_rest.sort(key=lambda lane: lane.used_at)
-            left = at_rest[: max(1, MAX_LANES // ROOM_SHARE)]
-            for lane in left:
-                del self._lanes[named[id(lane)]]
-                self._full.pop(lane.eid, None)
-                self._due.pop(lane.eid, None)
-                if self._greetings is not None:
-                    self._greetings.forget(lane)
-                lane.is_left = True
-                self.tally.unconfirmed += 0 if self._acks is None else lane.in_flight
-                self.tally.take(lane.sums())
+            at_rest = [name for name, lane in self._lanes.items() if self._may_leave(lane, now)]
+            at_rest.sort(key=lambda name: self._lanes[name].used_at)
+            left = [self._forget(name) for name in at_rest[: max(1, MAX_LANES // ROOM_SHARE)]]
+        self._leave_behind(left)
+
+    def keep_first(self) -> None:
+        """Of each key give back what second and further publishers of it have put (under the stream's lock)."""
+        with self._lock:
+            left = [self._forget(name) for name in tuple(self._lanes) if name[2]]
+        self._leave_behind(left)
+
+    def _forget(self, name: tuple[str, str, int]) -> Lane:
+        lane = self._lanes.pop(name)
+        self._full.pop(lane.eid, None)
+        self._due.pop(lane.eid, None)
+        if self._greetings is not None:
+            self._greetings.forget(lane)
+        lane.is_left = True
+        self.tally.unconfirmed += 0 if self._acks is None else lane.in_flight
+        self.tally.take(lane.sums())
+        return lane
+
+    def _leave_behind(self, left: list[Lane]) -> None:
         for lane in left:
             if self._acks is not None:
                 self._acks.forget(lane.eid)
@@ -460,7 +474,7 @@ class Outlet:
         with self._stalled:
             put_marker(self._session, lane.key, lane.source_id, priority, marker, waits=waits)
 
-    def _declare(self, key: str, priority: Priority, *, is_express: bool) -> Lane:
+    def _declare(self, key: str, priority: Priority, *, is_express: bool, place: int = 0) -> Lane:
         settings, is_reliable = self._settings, self._is_reliable
         publisher = declare_publisher(self._session, key, settings, priority, is_express=is_express)
         lane = Lane(
@@ -475,7 +489,7 @@ class Outlet:
             kept_limit=KEPT_BYTES if is_reliable else KEPT_BYTES_LATEST,
         )
         with self._lock:
-            self._lanes[key, f"{priority}{is_express}"] = lane
+            self._lanes[key, f"{priority}{is_express}", place] = lane
             if self._greetings is not None:
                 self._greetings.add(lane)
         if self._acks is not None:

@@ -34,6 +34,7 @@ from zsched.relay.streams.crowd import note_feeder
 from zsched.relay.streams.fence import Fence
 from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.pace import Pace
+from zsched.relay.streams.places import Places, PublisherId
 from zsched.relay.streams.receive import Receiver, undeclare
 from zsched.relay.streams.slots import Feed, KeyState, OutputSlot
 from zsched.relay.streams.tally import Tally
@@ -66,8 +67,13 @@ class Way(Protocol):
     def key_of(self, sample: Sample) -> str:
         """The key that a sample goes on under."""
 
-    def send(self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None) -> tuple[str, int]:
+    def send(
+        self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None, place: int = 0
+    ) -> tuple[str, int]:
         """Take one sample; answers (why something was dropped, how much of it)."""
+
+    def keep_first(self) -> None:
+        """Of each key forget what second and further publishers of it have put."""
 
     def look_after(self) -> None:
         """Called now and then."""
@@ -124,7 +130,12 @@ class OutputStream:
         self._stamps: OrderedDict[Timestamp, None] = OrderedDict()
         self._is_latest = route.settings.stream_class is StreamClass.LATEST
         max_hz = route.settings.max_hz
-        self._pace: Pace[Sample] | None = None if max_hz is None else Pace(max_hz, remembers=self._is_latest)
+        self._places = Places(self._is_there)
+        self._owner = ""
+        """Whose answers have passed last, by the expression that they come under."""
+        self._pace: Pace[tuple[Sample, int]] | None = (
+            None if max_hz is None else Pace(max_hz, remembers=self._is_latest)
+        )
 
     def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, *, is_from_start: bool = False) -> None:
         """Subscribe to an owner's output; nothing passes yet.
@@ -369,9 +380,9 @@ class OutputStream:
                     self._pass(slot, slot.keys.setdefault(name, KeyState(name=name)), (zid, eid), sample)
             if self._pace is None or not self._is_latest:
                 return
-            for sample in self._pace.overdue(monotonic_s()):
+            for sample, place in self._pace.overdue(monotonic_s()):
                 self._note_passed(monotonic_s())
-                self._counter.dropped(*self._outlet.send(sample))
+                self._counter.dropped(*self._outlet.send(sample, place=place))
 
     def count(self) -> StreamCount:
         """The counters now."""
@@ -492,23 +503,40 @@ class OutputStream:
         answer = None if self._times is None else self._times.answered(sample.timestamp, self._counter.stream)
         if answer is not None:
             self._counter.answered(answer[0], is_paired=answer[1])
+        place = 0
         if self._is_latest:
             stamp = sample.timestamp
             if stamp is not None and not self._fence.passes(self._outlet.key_of(sample), stamp):
                 self._counter.dropped("superseded")
                 return
+            place = self._place(sample)
         # by the applications' key: under that a new owner's value takes the place of an old one's
-        if self._pace is not None and not self._pace.passes(self._outlet.key_of(sample), sample, monotonic_s()):
-            self._counter.dropped("thinned")
-            return
+        if self._pace is not None:
+            line = (self._outlet.key_of(sample), place)
+            if not self._pace.passes(line, (sample, place), monotonic_s()):
+                self._counter.dropped("thinned")
+                return
         if self._notes_stamps and sample.timestamp is not None:
             self._stamps[sample.timestamp] = None
             if len(self._stamps) > MAX_STAMPS:
                 self._stamps.popitem(last=False)
         self._note_passed(monotonic_s() if size is None else self._counter.last_seen)
-        reason, dropped = self._outlet.send(sample, None, size)
+        reason, dropped = self._outlet.send(sample, None, size, place)
         if dropped:
             self._counter.dropped(reason, dropped)
+
+    def _place(self, sample: Sample) -> int:
+        """The place of its publisher among the owner's: an owner's first values take the place of another owner's."""
+        if self._carrier is not None and self._carrier.expr != self._owner:
+            self._owner = self._carrier.expr
+            self._places.clear()
+            self._outlet.keep_first()
+        return self._places.of(sample)
+
+    def _is_there(self, publisher: PublisherId) -> bool | None:
+        receivers = [slot.feed.receiver for slot in self._slots.values() if slot.feed is not None]
+        told = [one.is_there(publisher) for one in receivers if one is not None]
+        return None if all(one is None for one in told) else any(told)
 
     def _note_passed(self, now: float) -> None:
         if self._carrier is not None:

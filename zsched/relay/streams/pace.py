@@ -7,6 +7,7 @@ guards it.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Hashable
 from typing import Final, Generic, TypeVar
 
 T = TypeVar("T")
@@ -21,11 +22,11 @@ class Pace(Generic[T]):
         """``remembers``: passed over values are kept for `overdue` (streams that keep the newest)."""
         self._remembers = remembers
         self._period_s = 1.0 / max_hz
-        self._due: OrderedDict[str, float] = OrderedDict()
+        self._due: OrderedDict[Hashable, float] = OrderedDict()
         """{key: when it may pass again}, the one that has passed last at the end."""
-        self._passed_over: dict[str, T] = {}
+        self._passed_over: dict[Hashable, T] = {}
 
-    def passes(self, key: str, value: T, now: float) -> bool:
+    def passes(self, key: Hashable, value: T, now: float) -> bool:
         """True when the value may go on now; else it may be remembered until a newer one of its key comes."""
         due = self._due.get(key, now)
         if now < due:

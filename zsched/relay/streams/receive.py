@@ -28,6 +28,7 @@ from zsched.core.values.plan import StreamClass, StreamSettings
 from zsched.guard import guarded, tolerant
 from zsched.relay.streams.given import under
 from zsched.relay.streams.history import HeldValues
+from zsched.relay.streams.places import PublisherId
 
 JOIN_S: Final = 0.3
 REST_S: Final = 2.0
@@ -79,9 +80,9 @@ class Receiver:
         """
         is_latest = settings.stream_class is StreamClass.LATEST
         self._history: HeldValues | None = None
-        if with_history and is_latest and settings.keep_last:
-            self._history = HeldValues(session, expr, settings.keep_last, carry, origin)
-        self._carry = carry if self._history is None else self._history.live
+        if is_latest and settings.keep_last:
+            self._history = HeldValues(session, expr, settings.keep_last, carry, origin, asks=with_history)
+        self._carry = self._history.live if self._history is not None and with_history else carry
         self._depth, self._give_way = settings.depth, give_way
         self._ended = threading.Event()
         self._subscriber: Declared
@@ -108,6 +109,10 @@ class Receiver:
         except RuntimeError:
             self.close()
             raise
+
+    def is_there(self, publisher: PublisherId) -> bool | None:
+        """Whether a publisher with a cache (class ``latest``) shows its token; ``None``: it never has."""
+        return None if self._history is None else self._history.is_there(publisher)
 
     def close(self) -> None:
         """Unsubscribe; the thread ends behind what it has in hand."""

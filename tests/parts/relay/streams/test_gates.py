@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import zenoh
+import zenoh.ext
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import between, free_endpoint, until
@@ -187,6 +188,93 @@ def test_images_are_taken_beside_their_topics_key_and_given_under_it(bench: Benc
     until(lambda: heard == [f"0/seen/{image}"] * 2, "both")
     kept.undeclare()
     back.undeclare()
+
+
+def latched(session: zenoh.Session, key: str, depth: int = 1) -> zenoh.ext.AdvancedPublisher:
+    """A publisher as rmw_zenoh makes one of a transient-local topic."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        cache=zenoh.ext.CacheConfig(depth),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+        publisher_detection=True,
+    )
+
+
+def late_subscriber(session: zenoh.Session, key: str, heard: list[str]) -> zenoh.ext.AdvancedSubscriber[None]:
+    """A subscription as rmw_zenoh makes one of a transient-local topic."""
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key,
+        lambda sample: heard.append(sample.payload.to_string()),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+    )
+
+
+def has_all(heard: list[str], wanted: list[str]) -> bool:
+    return sorted(heard) == wanted
+
+
+def test_a_new_owner_gets_the_value_of_each_publisher_of_a_key(bench: Bench) -> None:
+    """Three drivers have put one transform each, once for all; the new owner heard one of three for ever."""
+    route = way_in(StreamClass.LATEST, "robot1/tf_static", "edge1/t/tf_static")
+    stream = bench.input(route)
+    drivers = [latched(bench.outside, "robot1/tf_static") for _ in range(3)]
+    for number, driver in enumerate(drivers):
+        driver.put(f"driver {number}")
+    until(lambda: stream.count().messages == 3, "three values")
+    everything = [f"driver {number}" for number in range(3)]
+    for epoch, owner in enumerate(("edge1", "edge2"), start=1):
+        target = replace(route, to_expr=f"{owner}/t/tf_static")
+        heard: list[str] = []
+        late: list[str] = []
+        node = late_subscriber(bench.outside, target.to_expr, heard)
+        stream.open(epoch, target)
+        until(partial(stream.is_matching, epoch), "the owner subscribes")
+        assert stream.flip(epoch) == 3
+        until(partial(has_all, heard, everything), "all")
+        other = late_subscriber(bench.another(), target.to_expr, late)
+        until(partial(has_all, late, everything), "also at a node of the worker that subscribes late")
+        node.undeclare()
+        other.undeclare()
+    ended = (str(bench.outside.zid()), drivers[1].id.eid)
+    drivers[1].undeclare()
+    again = latched(bench.outside, "robot1/tf_static")
+    until(lambda: stream._places._is_there(ended) is False, "its token goes")
+    again.put("driver 1, again")
+    until(lambda: stream.count().messages == 4, "the value of a driver that has begun again")
+    assert [sample.payload.to_string() for sample, _ in stream.kept()] == ["driver 0", "driver 2", "driver 1, again"]
+
+
+def test_a_late_application_gets_the_value_of_each_publisher_of_the_owner(bench: Bench) -> None:
+    settings = way_in(StreamClass.LATEST).settings
+
+    def way(owner: str) -> Route:
+        return Route(
+            stream="t/out/0",
+            direction=Direction.OUTPUT,
+            from_expr=f"{owner}/tf_static",
+            to_expr="robot1/tf_static",
+            settings=settings,
+        )
+
+    stream = bench.output(way("edge1"))
+    for epoch, (owner, count) in enumerate((("edge1", 3), ("edge2", 2)), start=1):
+        stream.open(epoch, way(owner))
+        stream.know(way(owner).from_expr)
+        stream.flip(epoch, drops_held=False)
+        drivers = [latched(bench.outside, f"{owner}/tf_static") for _ in range(count)]
+        wanted = [f"{owner}, driver {number}" for number in range(count)]
+        early: list[str] = []
+        late: list[str] = []
+        application = late_subscriber(bench.another(), "robot1/tf_static", early)
+        for driver, value in zip(drivers, wanted, strict=True):
+            driver.put(value)
+        until(lambda early=early, wanted=wanted, count=count: early[-count:] == wanted, "they go on")  # type: ignore[misc]
+        other = late_subscriber(bench.another(), "robot1/tf_static", late)
+        until(partial(has_all, late, wanted), "those of this owner, and of no other")
+        application.undeclare()
+        other.undeclare()
 
 
 def test_of_many_keys_those_give_way_that_have_rested_longest(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
