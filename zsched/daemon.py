@@ -53,7 +53,7 @@ from zsched.log_limit import log_to_stderr
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
 from zsched.runtime.access_rules import Side, common_names_of, names_of
-from zsched.runtime.adoption import Adoption
+from zsched.runtime.adoption import Adoption, tell_orders
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.desk import Desk
 from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
@@ -282,6 +282,7 @@ class Daemon:
             lambda problem: self._inbox.post(ev.ProblemReported(source="log", problem=problem)),
         )
         desk = Desk(me, self._inbox, bus, access.answer, decisions.answer, self._leave)
+        tell_orders(fleet, desk, bus)
         operators = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         operators.open()
         with contextlib.suppress(OSError):

@@ -377,6 +377,8 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
             f"a key that was made out for {', '.join(come)} before lets nobody in"  # whoever it is comes with another
         )
         yield replace(AT_ONCE, text=text, paths=("security.revoked",))
+    if before.orders != after.orders:
+        yield _set(AT_ONCE, "security.orders", _plain(before.orders), _plain(after.orders))
     nodes, others = ({node.name: (node.kind, _is_on_streams(node)) for node in fleet.nodes} for fleet in (old, new))
     for name in dict.fromkeys((*others, *nodes)):
         if name not in nodes or name not in others:

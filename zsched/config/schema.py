@@ -391,6 +391,11 @@ SECURITY: Final = Record(
             ListOf(Here(_LABEL_OF_KEY), least=1),
             "Keys that are not let in, as `zsched pki revoke` names them.",
         ),
+        "orders": Field(
+            ListOf(Here(NAME_BLOCK)),
+            "Nodes that may give commands, besides operators; of the others no node takes one.",
+            default="every node",
+        ),
         "signatures": Field(
             Choice.of(Signatures),
             "Signatures on votes, learnt values and commands: a frame without one is dropped (`required`), or taken "

@@ -51,6 +51,7 @@ def read_security(section: Section, cast: Cast, folder: Path, out: Collector) ->
         guests=guests,
         revoked=_revoked(given, {(one.name, one.role) for one in holders}, out),
         signatures=given.get("signatures", Signatures.REQUIRED),
+        orders=_orders(given, cast, operators, out),
     )
 
 
@@ -59,13 +60,22 @@ def _names(given: Section, key: str, cast: Cast, out: Collector) -> tuple[str, .
     seen: set[str] = set()
     for one in found:
         if one.value in cast.names:
-            out.error(
-                one.place, f"{one.value!r} is a node", "nodes may give commands anyway; give people names of their own"
-            )
+            out.error(one.place, f"{one.value!r} is a node", "give people names of their own")
         elif one.value in seen:
             out.error(one.place, f"{one.value!r} is there twice")
         seen.add(one.value)
     return tuple(sorted(seen))
+
+
+def _orders(given: Section, cast: Cast, operators: tuple[str, ...], out: Collector) -> tuple[str, ...] | None:
+    """The nodes that may give commands; ``None``: each of them."""
+    found: tuple[Located[str], ...] | None = given.get("orders")
+    for one in found or ():
+        if one.value not in cast.names:
+            out.error(one.place, f"{one.value!r} is no node", "operators give orders anyway: name nodes only")
+    if found == () and not operators:
+        out.error(given.where("orders"), "nobody could give an order", "name a node, or an operator below `operators:`")
+    return None if found is None else tuple(sorted({one.value for one in found}))
 
 
 def _misspelt(name: str, known: Iterable[str]) -> str:

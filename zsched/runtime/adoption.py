@@ -28,12 +28,20 @@ from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
 from zsched.runtime.sampler import Sampler
-from zsched.runtime.sealing import holders_of
+from zsched.runtime.sealing import orderers_of
 
 SOURCE = "restart"
 """Of the problem that says what a restart is needed for."""
 
 _log = logging.getLogger("zsched.daemon")
+
+
+def tell_orders(fleet: Fleet, desk: Desk, bus: ControlBus) -> None:
+    """Whose orders count from now on, those of this machine among them, and how long the desk waits for their end."""
+    security = fleet.security
+    desk.adopt(fleet.timing, None if security is None else security.orders)
+    if security is not None:
+        bus.take_orders_of(orderers_of(fleet, security))
 
 
 class Adoption(Struct, kw_only=True):
@@ -58,8 +66,7 @@ class Adoption(Struct, kw_only=True):
     _watches: dict[TaskId, WorkerWatch | None] = field(default_factory=dict)
 
     def begin(self) -> None:
-        """Tell the relay what it watches, and the desk how long it waits, by the file that the daemon starts with."""
-        self.desk.adopt(self.started_with.timing)
+        """Tell the relay what it watches, by the file that the daemon starts with."""
         self._tell_watches(self.started_with)
 
     def adopt(self, fleet: Fleet, is_agreed: bool = False) -> None:
@@ -83,12 +90,10 @@ class Adoption(Struct, kw_only=True):
         self.supervisor.adopt(self.recipes.specs)
         self.crew.keep(self.recipes.specs)
         self.access.adopt(fleet)
-        self.desk.adopt(fleet.timing)
         is_exclusive = any(task.exclusive for task in fleet.tasks)
         self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
         self.bus.know(names_of(fleet), limit_for(fleet.timing, len(fleet.tasks)))
-        if fleet.security is not None:
-            self.bus.take_orders_of(holders_of(fleet, fleet.security))
+        tell_orders(fleet, self.desk, self.bus)
         if is_exclusive:
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)

@@ -76,10 +76,11 @@ class Desk:
         self._waiting: dict[int, queue.SimpleQueue[object]] = {}
         self._lock = threading.Lock()
         self._order_s = Timing().order_s
+        self._orders_of: tuple[NodeId, ...] | None = None
 
-    def adopt(self, timing: Timing) -> None:
+    def adopt(self, timing: Timing, orders_of: tuple[NodeId, ...] | None = None) -> None:
         """Go by the clocks of the fleet that is in force from now on; any thread."""
-        self._order_s = timing.order_s
+        self._order_s, self._orders_of = timing.order_s, orders_of
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request of the socket (``status``, ``explain``, ``log``, ``weights``, ...).
@@ -114,6 +115,10 @@ class Desk:
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
         within_s = self._order_s if isinstance(command, Agreed) else ANSWER_TIMEOUT_S
         is_order = command is not None and not isinstance(command, Asking)
+        if is_order and self._orders_of is not None and self._node not in self._orders_of:
+            others = f"{' and '.join(self._orders_of) or 'no node'} may (`security: {{orders: [...]}}`)"
+            instead = "order there, or by an operator's certificate with --connect"
+            return {"error": f"{self._node} gives no orders in this fleet, {others}; {instead}"}
         if node != self._node:
             try:
                 return answer_json(self._bus.ask_node(node, command, within_s))

@@ -43,6 +43,12 @@ def holders_of(fleet: Fleet, security: Security) -> frozenset[Holder]:
     return frozenset(one for name, role in names for one in accepted(name, role, security.revoked))
 
 
+def orderers_of(fleet: Fleet, security: Security) -> frozenset[Holder]:
+    """Those of them whose orders are taken: operators, and the nodes that the file names, or all."""
+    holders, named = holders_of(fleet, security), security.orders
+    return frozenset(one for one in holders if named is None or one.role is Role.OPERATOR or one.name in named)
+
+
 def _keys(security: Security) -> Keys:
     from zsched.pki import signatures  # noqa: PLC0415 - it takes 8 MiB: only where something is signed
 

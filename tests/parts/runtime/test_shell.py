@@ -457,6 +457,18 @@ def test_a_program_on_this_machine_orders_in_no_operator_s_and_no_other_node_s_n
         assert event.command.asked == Asked(by=told)
 
 
+def test_a_node_that_may_give_no_orders_says_so_and_still_asks(house: House) -> None:
+    """A worker that reached the socket of its node could order what it liked."""
+    house.desk.adopt(Timing(), ("robot2", "robot3"))
+    for request in ({"verb": "change", "text": "x"}, {"verb": "change", "text": "x", "node": "robot2"}):
+        said = house.desk.answer({"by": "eve@robot1", **request})["error"]
+        assert said.startswith("robot1 gives no orders in this fleet, robot2 and robot3 may (`security: {orders: [")
+    assert house.events() == []
+    house.desk.adopt(Timing(), ("robot1",))
+    house.desk.answer({"verb": "restart", "task": "merge"})
+    assert [type(event) for event in house.events()] == [ev.RestartCommanded]
+
+
 def test_a_daemon_is_ended_for_good_on_its_own_machine_only(house: House) -> None:
     ended: list[str] = []
     desk = Desk("robot1", house.inbox, house.adapter, leave=lambda: ended.append("robot1"))

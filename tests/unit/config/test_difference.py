@@ -423,6 +423,12 @@ def test_nobody_has_to_restart_a_daemon_for_signatures_where_a_key_is_revoked_wi
     assert opens_anew(fleet_of(SECURED), fleet_of(revoked))
 
 
+def test_whose_orders_count_changes_at_once() -> None:
+    named = with_("security: {}", "security: {orders: [robot1]}", SECURED)
+    assert [one[0::3] for one in told(named, SECURED)] == [("security.orders", "takes effect at once")]
+    assert not opens_anew(fleet_of(SECURED), fleet_of(named))
+
+
 def test_what_comes_later_is_not_told_together_with_at_once() -> None:
     """A new candidate counts at once, and is let in only once the daemons have begun anew: the later one is told."""
     secured = f"{TEXT.replace('tcp/', 'tls/')}\nsecurity: {{}}\n"

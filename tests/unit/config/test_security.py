@@ -112,3 +112,13 @@ def test_quic_is_refused_for_its_links_do_not_end_when_they_are_refused() -> Non
     assert fault.message == "zenoh cannot end a refused link of quic/, and the fleet is secured (line 5)"
     assert fault.hint == "tls/0.0.0.0:7458"
     assert check_bytes(text.replace("security:", "").encode()).fleet is not None
+
+
+def test_only_the_nodes_that_are_named_give_orders_and_somebody_must() -> None:
+    found, every, people = (security(one) for one in ("{orders: [robot2]}", "{}", "{orders: [], operators: [ana]}"))
+    assert found is not None
+    assert every is not None
+    assert people is not None
+    assert (found.orders, every.orders, people.orders) == (("robot2",), None, ())
+    assert [one.message for one in check("{orders: [ana], operators: [ana]}").faults] == ["'ana' is no node"]
+    assert [one.message for one in check("{orders: []}").faults] == ["nobody could give an order"]

@@ -331,7 +331,7 @@ class ControlBus:
         """Of those that are let in let only these give orders from now on.
 
         The session itself lets in the same until it is opened anew. Meanwhile a key that is revoked, or a name that is
-        gone, must not undo that by an order.
+        gone, must not undo that by an order. A node that may give none is let in for good.
         """
         self._orders_of = frozenset(holders)
 
@@ -459,8 +459,8 @@ class ControlBus:
             if not isinstance(command, Asking):
                 asking = holder or self._holder_of(asker)
                 if asking is not None and self._orders_of is not None and asking not in self._orders_of:
-                    log.warning("refused command=%s from=%s why=revoked or gone", type(command).__name__, asking.label)
-                    raise WireError(sealing.SealFault.SIGNER, f"{asking.label} may give no orders any more")
+                    log.warning("refused command=%s from=%s why=it may give none", type(command).__name__, asking.label)
+                    raise WireError(sealing.SealFault.SIGNER, f"{asking.label} may give no orders")
                 log.info("command=%s from=%s", type(command).__name__, asker)
                 if asking is not None:
                     command = signed_by(asking, command)

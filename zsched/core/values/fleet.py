@@ -428,10 +428,12 @@ class Security(Struct, frozen=True, kw_only=True):
     revoked: tuple[str, ...] = ()
     """Sorted labels of keys that are not let in (`zsched.core.values.certificates`)."""
     signatures: Signatures = Signatures.REQUIRED
+    orders: tuple[NodeId, ...] | None = None
+    """Sorted: the nodes that may give commands, besides operators; ``None``: each of them."""
 
     def nameless(self) -> Security:
         """The section without the names that it lets in."""
-        return replace(self, operators=(), guests=(), revoked=())
+        return replace(self, operators=(), guests=(), revoked=(), orders=None)
 
 
 class Cell(Struct, frozen=True, kw_only=True):

@@ -58,7 +58,7 @@ from zsched.core.values.model import Acceptance, Asked
 from zsched.core.values.rehearsal import KeepRehearsal, Step, Strike
 from zsched.core.values.words import MAX_ASKER
 from zsched.errors import AdapterError
-from zsched.runtime.sealing import holders_of, seals_of
+from zsched.runtime.sealing import orderers_of, seals_of
 from zsched.sessions.config import control_config
 from zsched.wire import codec as wire
 
@@ -474,9 +474,11 @@ def test_who_is_gone_may_still_ask_whether_the_others_know(sealed: tuple[Peer, P
     assert answers == [told]
 
 
-def test_a_revoked_key_does_not_take_its_revocation_back_before_sessions_are_opened_anew(
-    sealed: tuple[Peer, Peer, Fleet],
+@pytest.mark.parametrize("by", [{"revoked": ("robot2",)}, {"orders": ("robot1",)}], ids=["revoked", "orders of others"])
+def test_a_key_whose_orders_count_no_more_does_not_take_that_back(
+    sealed: tuple[Peer, Peer, Fleet], by: dict[str, Any]
 ) -> None:
+    """A revoked one before sessions are opened anew; a node that is not named ever."""
     one, other, fleet = sealed
     assert fleet.security is not None
     back = ChangeFleet(document=Document(text=Text("fleet: f\n")))
@@ -493,14 +495,14 @@ def test_a_revoked_key_does_not_take_its_revocation_back_before_sessions_are_ope
 
     assert order() == RESULT
     one.events.clear()
-    security = replace(fleet.security, revoked=("robot2",))
-    one.bus.take_orders_of(holders_of(fleet, security))
+    security = replace(fleet.security, **by)
+    one.bus.take_orders_of(orderers_of(fleet, security))
     assert order() == CommandResult(outcome=CommandOutcome.INVALID, detail="robot1 refused it: signer")
     until(lambda: one.of(ev.FrameDropped), "that the frame is counted, behind the answer")
     assert one.of(ev.FrameDropped) == [ev.FrameDropped(kind="command", reason="signer")]
     assert not one.of(ev.FleetCommanded)
     assert not one.of(ev.Commanded)
-    one.bus.take_orders_of(holders_of(fleet, fleet.security))
+    one.bus.take_orders_of(orderers_of(fleet, fleet.security))
     assert order() == RESULT, "somebody else has taken it back"
 
 
