@@ -27,11 +27,9 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
-import zenoh
-from zenoh import CongestionControl, Sample, SampleKind, Session, Timestamp
+from zenoh import Sample, Session, Timestamp
 
 from zsched.clock import monotonic_s
-from zsched.core.hop.serial import serial_of
 from zsched.core.values.struct import Struct
 from zsched.relay.streams.lanes import Lane
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
@@ -144,7 +142,7 @@ class Crowd:
         self._putting_since = monotonic_s()
         try:
             if left:
-                self._put_dropping(lane, sample, stamp)
+                lane.put_dropping(self._session, sample, stamp)
             else:
                 lane.put(sample, stamp)
         finally:
@@ -281,33 +279,6 @@ class Crowd:
 
     def _has_ready_receiver(self) -> bool:
         return any(reader.receives and not reader.is_full for reader in tuple(self._readers.values()))
-
-    def _put_dropping(self, lane: Lane, sample: Sample, stamp: Timestamp | None) -> None:
-        """Put without waiting, under the next number; an advanced publisher numbers only what its cache has."""
-        is_numbered = isinstance(lane.publisher, zenoh.Publisher)
-        source = zenoh.SourceInfo(lane.source_id, serial_of(lane.count)) if is_numbered else None
-        if sample.kind == SampleKind.DELETE:
-            self._session.delete(
-                lane.key,
-                attachment=sample.attachment,
-                timestamp=stamp,
-                source_info=source,
-                congestion_control=CongestionControl.DROP,
-                priority=sample.priority,
-                express=sample.express,
-            )
-        else:
-            self._session.put(
-                lane.key,
-                sample.payload,
-                encoding=sample.encoding,
-                attachment=sample.attachment,
-                timestamp=stamp,
-                source_info=source,
-                congestion_control=CongestionControl.DROP,
-                priority=sample.priority,
-                express=sample.express,
-            )
 
 
 def note_feeder(zid: str) -> None:

@@ -13,7 +13,7 @@ receiver's lease ends (measured with zenoh 1.10.2: 4 s of an 8 s lease).
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from zenoh import CongestionControl, Priority, Reliability, Sample, SampleKind, Session, Timestamp, ext
@@ -74,30 +74,35 @@ class Lane(Sender, kw_only=True, eq=False):
 
     def put_again(self, session: Session, sent: Sent) -> None:
         """Put a kept sample on under the number it had (never into a cache a second time)."""
-        sample, publisher = sent.sample, self.publisher
-        source = zenoh.SourceInfo(self.source_id, serial_of(sent.number))
+        source = _SourceInfo(self.source_id, serial_of(sent.number))
+        self._put_by(session, sent.sample, sent.stamp, source, CongestionControl.BLOCK)
+
+    def put_dropping(self, session: Session, sample: Sample, stamp: Timestamp | None) -> None:
+        """Put without waiting, under the next number; an advanced publisher numbers only what its cache has."""
+        is_numbered = isinstance(self.publisher, _Plain)
+        source = _SourceInfo(self.source_id, serial_of(self.count)) if is_numbered else None
+        self._put_by(session, sample, stamp, source, CongestionControl.DROP)
+
+    def _put_by(
+        self,
+        session: Session,
+        sample: Sample,
+        stamp: Timestamp | None,
+        source: zenoh.SourceInfo | None,
+        congestion: CongestionControl,
+    ) -> None:
+        settings: dict[str, Any] = {
+            "attachment": sample.attachment,
+            "timestamp": stamp,
+            "source_info": source,
+            "congestion_control": congestion,
+            "priority": sample.priority,
+            "express": sample.express,
+        }
         if sample.kind == _DELETE:
-            session.delete(
-                self.key,
-                attachment=sample.attachment,
-                timestamp=sent.stamp,
-                source_info=source,
-                congestion_control=CongestionControl.BLOCK,
-                priority=publisher.priority,
-                express=sample.express,
-            )
-            return
-        session.put(
-            self.key,
-            sample.payload,
-            encoding=sample.encoding,
-            attachment=sample.attachment,
-            timestamp=sent.stamp,
-            source_info=source,
-            congestion_control=CongestionControl.BLOCK,
-            priority=publisher.priority,
-            express=sample.express,
-        )
+            session.delete(self.key, **settings)
+        else:
+            session.put(self.key, sample.payload, encoding=sample.encoding, **settings)
 
 
 def declare_publisher(
