@@ -245,6 +245,38 @@ def test_a_service_is_asked_under_the_robots_name(rig: Rig) -> None:
     assert asked == [f"0/edge1/merge/now/{TRIGGER}"]
 
 
+def test_a_request_whose_relay_is_killed_ends_without_a_reply_and_the_next_one_is_answered(rig: Rig) -> None:
+    """As docs/guide/ros2.md says: the relay that follows knows nothing of it, so a client needs a time of its own."""
+    robot, worker = rig.on_robot(), rig.on_edge()
+    worker.subscribe("edge1/merge/robot1/map")
+    held: list[zenoh.Query] = []
+    is_slow = True
+
+    def on_query(query: zenoh.Query) -> None:
+        if is_slow:
+            held.append(query)
+            return
+        with query:
+            query.reply(str(query.key_expr), b"done", attachment=query.attachment)
+
+    worker.entities.append(worker.session.declare_queryable(f"0/edge1/merge/now/{TRIGGER}", on_query, complete=True))
+    rig.move("edge1")
+
+    def ask() -> Any:
+        mark = encode_attachment(Attachment(sequence=1, stamp_ns=time.time_ns(), gid=bytes(16)))
+        all_complete = zenoh.QueryTarget.ALL_COMPLETE
+        return robot.session.get(f"0/merge_now/{TRIGGER}", target=all_complete, attachment=mark, timeout=50.0)
+
+    replies = ask()
+    until(lambda: held, "the owner has the request")
+    rig.kill_relay()
+    assert list(replies) == []
+    is_slow = False
+    held.clear()
+    rig.move("edge1")
+    until(lambda: [reply.ok is not None for reply in ask()] == [True], "the next request is answered")
+
+
 ACTION_FILE = FILE.replace(
     """      inputs: [{topic: /map, worker_topic: "/{target}/merge/{robot}/map", class: latest}]
       outputs: [{topic: /merged_map, worker_topic: "/{target}/merge/map", class: latest}]

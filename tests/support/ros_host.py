@@ -6,6 +6,8 @@ Knows: rmw_zenoh's router, local sides, the executor's steps. Does not know: wha
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 from functools import partial
 
 import zenoh
@@ -60,6 +62,13 @@ class RosHost:
     def assert_nothing_is_unaccounted(self) -> None:
         """Every sample that came in is somewhere in the counters, of every stream (`zsched.core.hop.books`)."""
         assert_nothing_is_unaccounted(self.reports.told)
+
+    def kill_relay(self) -> None:
+        """Without a word, as the kernel does when memory is short; another one follows, and opens the owner's slot."""
+        pid = self._relay.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        until(lambda: self._relay.pid not in (None, pid), "another relay runs")
 
     def move(self, owner: str) -> None:
         """To a new owner, whose predecessor is closed at the end."""
