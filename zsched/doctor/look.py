@@ -31,6 +31,7 @@ from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.ipc.takeover import Door
 from zsched.runtime.access_rules import Side
 from zsched.runtime.tls import asker_in, session_text
+from zsched.runtime.zenoh_file import judged
 from zsched.sessions import config as zenoh_config
 from zsched.wire.codec import from_plain
 
@@ -61,7 +62,7 @@ class _Asked(Struct, frozen=True, kw_only=True):
 
 def look(machine: Machine, *, is_fleet: bool) -> Scene:
     """Everything that the checks need; blocks for some seconds when nodes are silent."""
-    reading = check_file(machine.file)
+    reading = judged(check_file(machine.file))
     socket, node = places.socket_path(machine.runtime_folder, machine.node), machine.node
     own, refusal = _own(socket)
     door = None if own is None else socket

@@ -26,7 +26,7 @@ from zsched.files import read_regular
 from zsched.runtime.own_addresses import Address, addresses_at
 from zsched.runtime.sealing import seals_of
 from zsched.runtime.secured import CERTIFICATE, files_by, require_own
-from zsched.runtime.tls import ENCRYPTED, PLAIN, plain_text_problem, protocol_of
+from zsched.runtime.tls import ENCRYPTED, protocol_of
 from zsched.runtime.zenoh_file import operator_json5
 from zsched.sessions.certificate import common_names, validities
 from zsched.sessions.config import tls_settings
@@ -54,20 +54,6 @@ UNPROVEN: Final = {
     "_signature": "frames with a wrong signature",
 }
 """{end of a counter's name: what it counts}."""
-
-
-def nothing_in_plain_text(scene: Scene) -> Result:
-    """Whether, with TLS, this node listens with TLS only."""
-    try:
-        protocol = protocol_of(scene.fleet, operator_json5(scene.fleet))
-    except ConfigError as error:
-        return failed(str(error), fix=MEND)
-    if protocol == PLAIN:
-        return skipped("TLS is not set up")
-    problem = plain_text_problem(scene.me, protocol)
-    if problem is not None:
-        return failed(problem, fix="write tls/ in place of tcp/ in its `listen:`")
-    return passed(f"everything of {scene.node} listens with {protocol}")
 
 
 # --- certificates ----------------------------------------------------------------------------------------------------

@@ -85,7 +85,6 @@ CHECKS: Final[tuple[Check, ...]] = (
         run=network.is_not_alone_on_loopback,
     ),
     Check(name="net.ports", asks="Does nobody else listen on its ports?", run=network.ports_are_ours),
-    Check(name="tls.plain_text", asks="With TLS, is nothing in plain text?", run=security.nothing_in_plain_text),
     Check(
         name="tls.certificates",
         asks="Are its certificates its own, and far from their end?",

@@ -49,9 +49,10 @@ from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
 from zsched.guard import end_with, ends_within, guarded
 from zsched.sessions.closing import CLOSE_S
+from zsched.sessions.config import relay_endpoint
 from zsched.wire.keyspace import Keyspace
 from zsched.worker.roles import RoleWatch
-from zsched.worker.start import open_session, relay_endpoint
+from zsched.worker.start import open_session
 
 LOOK_S: Final = 2.0
 """How often the node is asked for its state while the role stays."""

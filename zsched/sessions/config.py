@@ -208,16 +208,14 @@ def application_config(session: str, listen: str) -> str:
 
     It listens at ``listen``, where workers dial it, and dials nobody; nobody hears of it by gossip.
     """
-    import zenoh  # noqa: PLC0415 - the operator's own settings (TLS, access control) hold here, too
-
-    config = zenoh.Config.from_json5(session)
-    for path, value in {
-        "listen/endpoints": list(_small_buffers((listen,))),
-        "connect/endpoints": [],
-        "scouting/gossip/enabled": False,
-    }.items():
-        config.insert_json5(path, json.dumps(value))
-    return str(config)
+    return on_top_of(
+        session,
+        {
+            "listen/endpoints": list(_small_buffers((listen,))),
+            "connect/endpoints": [],
+            "scouting/gossip/enabled": False,
+        },
+    )
 
 
 def introduction_config(session: str) -> str | None:
@@ -226,37 +224,40 @@ def introduction_config(session: str) -> str | None:
     ``None`` when the session does not dial by gossip, or nobody at all by its configuration: there is nothing to mend,
     or nobody to begin with. See `zsched.sessions.relink`.
     """
-    import zenoh  # noqa: PLC0415 - the operator's own settings (TLS, access control) hold here, too
-
-    config = zenoh.Config.from_json5(session)
-    if json.loads(config.get_json("mode")) != "peer" or not json.loads(config.get_json("connect/endpoints")):
+    if setting(session, "mode") != "peer" or not setting(session, "connect/endpoints"):
         return None
-    if json.loads(config.get_json("scouting/gossip/autoconnect")) is not None:
+    if setting(session, "scouting/gossip/autoconnect") is not None:
         return None  # our own setting for "only what is in `connect`"
-    for path, value in {
-        "listen/endpoints": [],
-        "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "always"}},
-        "transport/shared_memory/enabled": False,
-    }.items():
-        config.insert_json5(path, json.dumps(value))
-    return str(config)
+    return on_top_of(
+        session,
+        {
+            "listen/endpoints": [],
+            "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
+            "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "always"}},
+            "transport/shared_memory/enabled": False,
+        },
+    )
 
 
 def lease_s(session: str) -> float:
     """How long a peer of a session (its configuration) may be silent before zenoh ends the link."""
-    import zenoh  # noqa: PLC0415 - as above
-
-    return float(json.loads(zenoh.Config.from_json5(session).get_json("transport/link/tx/lease"))) / 1000
+    return float(setting(session, "transport/link/tx/lease")) / 1000
 
 
-def setting(operator_json5: str, path: str) -> Any:
-    """What the operator's own text says at one place, else zenoh's default; ``None`` where there is no text.
+def relay_endpoint(session: str) -> str:
+    """Where a worker's session dials its own node's relay (the first of ``connect``); empty: nowhere."""
+    endpoints = setting(session, "connect/endpoints")
+    first = endpoints[0] if isinstance(endpoints, list) and endpoints else ""
+    return first if isinstance(first, str) else ""
+
+
+def setting(text: str, path: str) -> Any:
+    """What a configuration says at one place, else zenoh's default; ``None`` where there is no text.
 
     Raises:
         ValueError: it is not a zenoh configuration.
     """
-    return json.loads(_parsed(operator_json5).get_json(path)) if operator_json5.strip() else None
+    return json.loads(_parsed(text).get_json(path)) if text.strip() else None
 
 
 def tls_settings(operator_json5: str) -> Settings:
@@ -403,7 +404,7 @@ def _small_buffer(endpoint: str) -> str:
 
 def _render(settings: Settings, operator_json5: str) -> str:
     if operator_json5.strip():
-        return _on_top_of(operator_json5, settings)
+        return on_top_of(operator_json5, settings)
     tree: Settings = {}
     for path, value in settings.items():
         *parents, leaf = path.split("/")
@@ -414,8 +415,12 @@ def _render(settings: Settings, operator_json5: str) -> str:
     return json.dumps(tree)
 
 
-def _on_top_of(operator_json5: str, settings: Settings) -> str:
-    """The operator's file with our settings over it."""
+def on_top_of(operator_json5: str, settings: Settings) -> str:
+    """A session's configuration with other settings over it.
+
+    Raises:
+        ValueError: it is not a zenoh configuration.
+    """
     config = _parsed(operator_json5)
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))

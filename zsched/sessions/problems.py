@@ -21,7 +21,7 @@ MAX_WHY: Final = 200
 MAX_NAMED: Final = 4
 
 _SOURCE_LINE: Final = re.compile(r" at \S+\.rs:\d+\.?")
-_BOUND_TO: Final = re.compile(r"bound to (\S+?)(?:#\S*?)?:? ")
+_BOUND_TO: Final = re.compile(r"bound to (\S+) ")
 _NO_ANSWER: Final = "Unable to connect to any of"
 _ASKED: Final = re.compile(r"Single\(([^)]+)\)")
 _OS_ERROR: Final = re.compile(r"os error (\d+)")
@@ -35,7 +35,7 @@ def why_not_open(config: str, error: Exception) -> str:
     text = _SOURCE_LINE.sub("", str(error))
     endpoints = _listens(config)
     named = _BOUND_TO.search(text)
-    endpoints = endpoints[:MAX_NAMED] if named is None else (named.group(1),)
+    endpoints = endpoints[:MAX_NAMED] if named is None else (Endpoint.of(named.group(1).rstrip(":")).place,)
     number = _OS_ERROR.search(text)
     why, remedy = _explained(int(number.group(1)) if number is not None else 0, endpoints, text)
     if not endpoints:
@@ -52,7 +52,7 @@ def _unanswered(text: str) -> str:
 def _explained(number: int, endpoints: tuple[str, ...], text: str) -> tuple[str, str]:
     """(why, what to do)."""
     if number == errno.EADDRINUSE:
-        ports = " or ".join(f"sport = :{endpoint.rpartition(':')[2]}" for endpoint in endpoints)
+        ports = " or ".join(f"sport = :{Endpoint.of(endpoint).port}" for endpoint in endpoints)
         return (
             "another program has that port",
             f"end that program (`ss -ltnp '{ports}'` names it), or give this node another port in the fleet file",

@@ -15,7 +15,6 @@ it, and one that was not the owner of the epoch before has none: else an empty s
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import math
 import queue
@@ -32,6 +31,7 @@ from zsched.core.values.plan import Role, WorkerRole
 from zsched.core.values.struct import Struct
 from zsched.guard import call_plain, guarded, tolerant
 from zsched.ipc.pipe import decode_chunk, encode_chunk
+from zsched.sessions.config import on_top_of, relay_endpoint, setting
 from zsched.wire.keyspace import counter
 from zsched.worker.troubles import Troubles
 
@@ -99,17 +99,19 @@ class StateLink:
 
     def _opened(self) -> zenoh.Session | None:
         try:
-            config = zenoh.Config.from_json5(self._zenoh_config)
-            endpoints = json.loads(config.get_json("connect/endpoints"))
-            if json.loads(config.get_json("mode")) == "client" or not isinstance(endpoints, list) or not endpoints:
+            relay = relay_endpoint(self._zenoh_config)
+            if setting(self._zenoh_config, "mode") == "client" or not relay:
                 return self._main
-            config.insert_json5("mode", json.dumps("client"))
-            config.insert_json5("listen/endpoints", "[]")
-            config.insert_json5("connect/endpoints", json.dumps(endpoints[:1]))
-            config.insert_json5("connect/timeout_ms", json.dumps(round(RELAY_S * 1000)))
             # Its one link is to its own relay, which judges what comes; by a peer's rules that one speaks for its own
             # node only, and another node's state would not be let in.
-            config.insert_json5("access_control/enabled", "false")
+            own = {
+                "mode": "client",
+                "listen/endpoints": [],
+                "connect/endpoints": [relay],
+                "access_control/enabled": False,
+            }
+            own["connect/timeout_ms"] = round(RELAY_S * 1000)
+            config = zenoh.Config.from_json5(on_top_of(self._zenoh_config, own))
             return zenoh.open(config)
         except (zenoh.ZError, ValueError) as error:
             if not self._has_told:

@@ -102,13 +102,6 @@ def open_session(zenoh_config: str) -> zenoh.Session:
             time.sleep(AGAIN_S)
 
 
-def relay_endpoint(zenoh_config: str) -> str:
-    """Where a worker's session dials its own node's relay (the first of ``connect``); empty: nowhere."""
-    endpoints = json.loads(zenoh.Config.from_json5(zenoh_config).get_json("connect/endpoints"))
-    first = endpoints[0] if isinstance(endpoints, list) and endpoints else ""
-    return first if isinstance(first, str) else ""
-
-
 def _deadline_s(text: str) -> float | None:
     try:
         return float(text) / 1e3 if text else None

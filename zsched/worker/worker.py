@@ -46,7 +46,7 @@ from zsched.ipc.pipe import decode_end
 from zsched.latch import Latch
 from zsched.log_limit import limit_library
 from zsched.sessions.closing import ALARM_S, CLOSE_S
-from zsched.sessions.config import lease_s
+from zsched.sessions.config import lease_s, relay_endpoint
 from zsched.sessions.stalled_links import StalledLinks
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import END_CHUNK, Keyspace
@@ -62,7 +62,7 @@ from zsched.worker.roles import RoleWatch
 from zsched.worker.samples import BY_CLASS, Input, KeepLast, Marker, Received
 from zsched.worker.services import Handler, Service
 from zsched.worker.snapshot import TIMEOUT_S, Offer, Restorer, StateBook, StateLink, fetch
-from zsched.worker.start import open_session, relay_endpoint, surroundings
+from zsched.worker.start import open_session, surroundings
 from zsched.worker.troubles import Troubles
 
 FINISH_S: Final = 2.0

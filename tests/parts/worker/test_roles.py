@@ -13,11 +13,10 @@ from support.sessions import opened
 from support.waiting import free_endpoint, until
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.relay.roles import RoleServer
-from zsched.sessions.config import data_config, worker_config
+from zsched.sessions.config import data_config, relay_endpoint, worker_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 from zsched.worker.roles import RoleWatch
-from zsched.worker.start import relay_endpoint
 
 KEYS = Keyspace("test")
 KEY = KEYS.role("edge1", "task")

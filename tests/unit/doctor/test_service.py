@@ -211,7 +211,7 @@ def own(tmp_path: Path) -> Scene:
 
 def test_the_fleets_own_certificates_are_told_of_a_week_before_they_end(own: Scene, tmp_path: Path) -> None:
     now = datetime.now(UTC)
-    for name in ("tls.certificates", "tls.key", "tls.plain_text", "tls.open"):
+    for name in ("tls.certificates", "tls.key", "tls.open"):
         assert run(name, own).verdict is PASS, run(name, own)
     assert security.certificates_last(own, now + timedelta(days=22)).verdict is PASS
     assert_finds(
@@ -310,9 +310,6 @@ def test_a_session_without_certificates_at_a_public_address_is_found(tmp_path: P
     assert run("tls.open", scene_of(tmp_path, own, root=tmp_path)).verdict is PASS
 
 
-def test_plain_text_beside_tls_is_found(secured: Scene, tmp_path: Path) -> None:
-    assert run("tls.plain_text", secured).verdict is PASS
-    half = scene_of(tmp_path, secured.file.read_text().replace("control: tls/", "control: tcp/"))
-    assert_finds(run("tls.plain_text", half), FAIL, "tcp/0.0.0.0:21257")
+def test_a_zenoh_file_that_cannot_be_read_is_found(secured: Scene, tmp_path: Path) -> None:
     (tmp_path / "zenoh.json5").write_text(json.dumps({"nosuch": 1}))
-    assert_finds(run("tls.plain_text", secured), FAIL, "not a zenoh configuration")
+    assert_finds(run("tls.open", secured), FAIL, "not a zenoh configuration")
