@@ -1,4 +1,4 @@
-"""Real relays and workers size the send buffers of their links, whatever class a stream has."""
+"""Real relays and workers size the send buffers of their links, whatever class a stream has, and keep no memory."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
-from support.relay_rig import ROBOT, Rig, relay_rig, slot
+from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until
 from zsched.core.hop.room import LARGE, SMALL
@@ -52,3 +53,25 @@ def test_large_samples_there_and_back_get_large_buffers_on_both_sides(rig: Rig, 
     until(are_large, "the relay's towards the application, the worker's towards the relay")
     assert set(back) == {MIB}
     kept.undeclare()
+
+
+@pytest.mark.long
+def test_a_relay_gives_back_what_large_samples_took(rig: Rig) -> None:
+    """Samples of 80 MiB left 360 MB with it for good."""
+    rig.start_worker("edge1")
+    app = Application(rig.app)
+    rig.move(slot(1, "edge1", StreamClass.RELIABLE, 1))
+    until(app.connected, "the application sees the relay's subscription")
+    relay = psutil.Process(rig.relays[ROBOT].pid)
+    before = relay.memory_full_info().uss
+    app.padding = bytes(80 * MIB)
+    for _ in range(3):
+        app.put()
+        until(lambda: len(app.back) == app.sent, "the large answer")
+    app.padding = b""
+
+    def is_small() -> bool:
+        app.put()
+        return bool(relay.memory_full_info().uss < before + 20 * MIB)
+
+    until(is_small, "the memory is given back")

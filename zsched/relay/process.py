@@ -32,7 +32,7 @@ from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
 from zsched.errors import WireError
 from zsched.guard import calmed, ends_within, guarded, on_failure
-from zsched.heap import give_back
+from zsched.heap import Leftovers, give_back
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.relay.application import Application
@@ -427,10 +427,11 @@ class RelayProcess:
     def _count(self) -> None:
         due = awake_s()
         pause = threading.Event()
-        introductions = Introductions()
+        introductions, leftovers = Introductions(), Leftovers()
         while True:
             due = max(due + COUNT_S, awake_s())  # none is made up for
             pause.wait(due - awake_s())
+            leftovers.tend(awake_s())
             self._tell_counts()
             self._tell_refused()
             for kind in calmed(monotonic_s()):
