@@ -32,7 +32,7 @@ from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
 from zsched.errors import WireError
 from zsched.guard import calmed, ends_within, guarded, on_failure
-from zsched.heap import Leftovers, give_back
+from zsched.heap import Leftovers
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
 from zsched.relay.application import Application
@@ -524,7 +524,6 @@ def run(
         Books(books),  # the relay before has gone: it had our port
     )
     application.open(config)
-    give_back()
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups, parent = _signals_wake(), parent or os.getppid()
     try:

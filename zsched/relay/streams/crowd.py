@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -80,10 +79,8 @@ class Reader(Struct, eq=False):
     def compare(self, put: int) -> None:
         """Whether it receives the stream, of which so many bytes have been put; nobody knows while it has no room."""
         told = self.link.account()
-        if told is None or (put - self.sent[0] < TOLD_BYTES and not self.is_full):
-            return
-        before, self.sent = self.sent, (put, told.acked + told.held)
-        if not self.is_full:
+        if told is not None and not self.is_full and put - self.sent[0] >= TOLD_BYTES:
+            before, self.sent = self.sent, (put, told.acked + told.held)
             self.receives = 2 * (self.sent[1] - before[1]) >= put - before[0]
 
     def look(self, now: float, *, has_room: bool) -> None:
@@ -129,7 +126,7 @@ class Crowd:
         self._is_closed = False
         self._put_count = self._put_before = self._put_bytes = 0
         """All samples put so far, those until the last look at the links, and all bytes."""
-        self._heard: OrderedDict[str, tuple[int, int]] = OrderedDict()
+        self._heard: dict[str, tuple[int, int]] = {}
         """{session: how many had been put when it was heard and its link stayed, and when it was last heard}."""
         self._putting_since: float | None = None
         self._owed: dict[Lane, tuple[Sample, Timestamp | None]] = {}
@@ -193,11 +190,10 @@ class Crowd:
         """
         since, now = self._putting_since, monotonic_s()
         period_s, self._cared_at = now - self._cared_at, now
-        if since is None or now - since < SLOW_PUT_S:
-            self._look(now)
+        is_slow = since is not None and now - since >= SLOW_PUT_S
+        self._look(now, SLOW_PUT_S if is_slow else LOOK_S)  # it may wait for one that has just come
+        if since is None or not is_slow:
             return
-        if self._look(now, period_s=SLOW_PUT_S):
-            return  # it may wait for one that has come since the put thread's own look
         full = self._full()
         self._charge(full, min(period_s, MAX_CHARGE_S))
         if now - since < STUCK_S or not self._has_ready_receiver():
@@ -209,8 +205,8 @@ class Crowd:
 
     # --- one put -----------------------------------------------------------------------------------------------------
 
-    def _look(self, now: float, period_s: float = LOOK_S) -> bool:
-        """Know the links, now and then; ``True`` when there is nobody to protect from anybody."""
+    def _look(self, now: float, period_s: float = LOOK_S) -> None:
+        """Know the links, now and then."""
         with self._looking:
             if now - self._looked_at >= period_s:
                 links = [link for link in self._sockets.links() if link.zid not in _feeders]
@@ -219,7 +215,6 @@ class Crowd:
                 self._looked_at, self._put_before = now, self._put_count
                 for reader in () if self._is_latest else self._readers.values():  # `latest` may go by shared memory
                     reader.compare(self._put_bytes)
-            return len(self._readers) < 2
 
     def _count_returned(self, links: list[LinkSocket], passed_s: float) -> None:
         """Nodes and their workers are peers, and receive nothing here."""
@@ -233,7 +228,7 @@ class Crowd:
             elif 0 < link.silent_s() < passed_s:  # 0: it is gone
                 self._heard[link.zid] = (newest, before)
         while len(self._heard) > MAX_KNOWN:
-            self._heard.popitem(last=False)
+            self._heard.pop(next(iter(self._heard)))
 
     def _wait(self) -> tuple[Reader, ...]:
         """Wait for room at every link; returns the receivers that are left behind and have none."""
