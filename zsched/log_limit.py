@@ -13,6 +13,7 @@ import threading
 from typing import Final
 
 from zsched.clock import monotonic_s
+from zsched.screen import harmless
 
 BURST: Final = 100.0
 RATE_HZ: Final = 5.0
@@ -61,11 +62,7 @@ class PlainLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The record; what follows a line end is indented, and control characters are replaced by ``?``."""
-        text = super().format(record)
-        if text.isprintable():
-            return text
-        plain = "".join(char if char.isprintable() or char in "\n\t" else "?" for char in text)
-        return plain.replace("\n", "\n  ")
+        return harmless(super().format(record)).replace("\n", "\n  ")
 
 
 def log_to_stderr(level: str, form: str) -> None:

@@ -36,7 +36,7 @@ from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 def with_people(folder: Path) -> Json:
     """Two robots, and two edges of which one gives no address; an operator and a guest have a folder of their own."""
     tree = echo_fleet(robots=2, edges=2, stream_class="reliable")
-    secured(tree, folder, security={"operators": ["ana"], "guests": ["screen"]})
+    secured(tree, folder, security={"operators": ["ana"], "guests": ["screen"], "orders": ["robot1", "robot2"]})
     del tree["nodes"]["edge2"]["host"], tree["nodes"]["edge2"]["listen"]
     with opened(folder / "authority", tree["fleet"]) as authority:
         for name, role in (("ana", Role.OPERATOR), ("screen", Role.GUEST)):
@@ -99,6 +99,14 @@ def flags_at(bed: Testbed, node: str) -> dict[tuple[str, str], str]:
     """{(node, kind): in whose name} of the flags that a node knows."""
     nodes = bed.status(node)["nodes"]
     return {(one["name"], flag["kind"]): flag["by"] for one in nodes for flag in one.get("flags", ())}
+
+
+def test_a_node_that_may_give_no_orders_asks_and_orders_nothing(bed: Testbed) -> None:
+    assert zsched(bed, "edge1", "status").returncode == 0
+    said = zsched(bed, "edge1", "pin", TASK, "edge2", "--yes")
+    assert said.returncode == 1
+    assert "edge1 gives no orders in this fleet, robot1 and robot2 may" in " ".join(said.stderr.split())
+    assert bed.task("robot1").get("pin") is None
 
 
 @pytest.mark.long

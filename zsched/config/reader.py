@@ -17,6 +17,7 @@ from functools import lru_cache
 from typing import Final, TypeAlias
 
 from zsched.core.values.struct import Struct, field
+from zsched.screen import printable
 
 MAX_FILE_BYTES: Final = 256 << 10
 """Three thousand rules and more; each is checked, and an operator waits seconds."""
@@ -116,7 +117,7 @@ class Collector:
     def _fault(self, place: Place, message: str, hint: str) -> Fault:
         lines = self._lines[place.file]
         source = lines[place.line - 1] if 0 < place.line <= len(lines) else ""
-        source = "".join(char if char.isprintable() or char == "\t" else "\ufffd" for char in source)
+        source = printable(source)
         width = max(1, min(place.width, len(source) - place.col + 1))
         line, col, file = place.line, place.col, place.file
         return Fault(line=line, col=col, message=message, hint=hint, source_line=source, width=width, file=file)

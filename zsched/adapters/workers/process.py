@@ -25,6 +25,7 @@ from pathlib import Path
 from zsched import log_limit
 from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.clock import awake_s
+from zsched.screen import harmless
 
 LAUNCHER = str(Path(__file__).with_name("launch.py"))
 MAX_LINE_BYTES = 2048
@@ -38,7 +39,6 @@ INTAKE_WINDOW_S = 0.1
 POLL_S = 0.05
 """How often exits are looked for on kernels without pidfd."""
 
-CONTROLS = {code: "\N{REPLACEMENT CHARACTER}" for code in (*range(32), *range(127, 160)) if code != 9}
 
 GUARD_SCRIPT = (
     "groups=' '; while read -r sign group; do case $sign in "
@@ -354,7 +354,7 @@ class ProcessWatch:
 
 def _printable(line: bytes) -> str:
     """A line as text that cannot command the reader's terminal."""
-    return line.decode(errors="replace").rstrip("\r\n").translate(CONTROLS)
+    return harmless(line.decode(errors="replace").rstrip("\r\n"))
 
 
 def _own_python(command: Sequence[str]) -> tuple[str, ...]:
