@@ -13,6 +13,7 @@ Knows: files, lines, the fields of a line. Does not know: what a story means.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import queue
@@ -46,6 +47,8 @@ TOLD_BYTES = 64 * 1024
 ASKED_LIMIT = 4
 """Questions of other machines that may wait for the log's thread."""
 QUEUE_LIMIT = 1000
+RESERVE_BYTES = 8 * 1024 * 1024
+"""The last bytes of a disk are the state's, of which a save needs a second one."""
 CLOSE_S = 0.5
 RETRY_S = 5.0
 """A disk that refuses lines is asked again after this time, also where there is no new one."""
@@ -219,6 +222,9 @@ class DecisionLog:
 
         What a power cut has torn stays a line of its own.
         """
+        disk = os.statvfs(self._folder)
+        if disk.f_bavail * disk.f_frsize < RESERVE_BYTES:
+            raise OSError(errno.ENOSPC, "the disk is full, and its last bytes are the state's")
         path = self._folder / NAME
         if path.exists() and path.stat().st_size + len(line) > self._file_bytes:
             path.replace(self._folder / OLD_NAME)

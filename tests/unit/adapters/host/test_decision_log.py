@@ -129,6 +129,20 @@ def test_a_full_disk_costs_lines_which_are_counted_and_told_and_never_half_a_lin
     assert kept.told[1:] == [None]
 
 
+def test_the_last_bytes_of_a_disk_are_the_state_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = Kept(tmp_path)
+    kept.write(story("first"))
+    free = os.statvfs(tmp_path)
+    monkeypatch.setattr(decision_log, "RESERVE_BYTES", 2 * free.f_blocks * free.f_frsize)
+    kept.write(story("lost"))
+    assert [str(told).partition("; ")[0].partition("written: ")[2] for told in kept.told] == [
+        "the disk is full, and its last bytes are the state's"
+    ]
+    monkeypatch.undo()
+    kept.write(story("again"))
+    assert "lost" not in [entry["text"] for entry in lines(tmp_path)]
+
+
 def test_a_disk_that_has_room_again_is_seen_without_a_new_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fleet at rest writes none for hours, and its status had the problem for as long."""
     kept = Kept(tmp_path)
