@@ -17,7 +17,7 @@ from zsched.core.events import AcceptAsked, PrepareAsked
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import WorkerSpec, electorate_hash
-from zsched.core.values.messages import Accept, Accepted, Prepare, Promise
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import (
     Acceptance,
     Ballot,
@@ -69,11 +69,14 @@ def test_an_elector_s_promise_and_acceptance_count_once_however_often_they_come(
 def test_promises_and_acceptances_of_an_earlier_attempt_count_nothing() -> None:
     register = proposer()
     first = proposed(register)
-    now, step = 0.0, Step()
-    while step.prepare is None:
-        now = max(register.next_deadline(), now + 0.001)
-        step = did(register.tick, now)
-    second = step.prepare.ballot
+    rival = ballot_of(first.counter + 1, "r3")
+    for elector in ("r2", "r3"):
+        no = Refused(elector=elector, task="merge", ballot=first, refusal=Refusal.BALLOT, promised=rival)
+        did(register.on_answer, no, 0.01)
+    now = register.next_deadline()
+    asked = did(register.tick, now).prepare
+    assert asked is not None
+    second = asked.ballot
     assert second > first
     for elector in ELECTORS:
         assert did(register.on_answer, promise(elector, first), now) == Step()

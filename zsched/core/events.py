@@ -150,6 +150,12 @@ class LearntAsked(Struct, frozen=True, kw_only=True):
     request: int
 
 
+class StateSaved(Struct, frozen=True, kw_only=True):
+    """The durable state is on disk; the loop stood still for ``took_s``."""
+
+    took_s: float
+
+
 class PersistFailed(Struct, frozen=True, kw_only=True):
     """The durable state could not be written; nothing that depended on it was sent."""
 
@@ -532,6 +538,7 @@ Event = (
     | VotesReceived
     | LearntReceived
     | LearntAsked
+    | StateSaved
     | PersistFailed
     | FleetAsked
     | FleetAnswered

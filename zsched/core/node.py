@@ -81,7 +81,7 @@ class Node(Stages):
             executor.start(todo)
             value = self.registers[name].value
             if value.revision > 0:
-                work.carry_out(self, value, "known from before the restart", todo, now, is_known=True)
+                work.take(self, value, "known from before the restart", todo, now, is_known=True)
         return self._finish(now)
 
     def handle(self, event: ev.Event, now: float) -> tuple[do.Instruction, ...]:
@@ -121,7 +121,8 @@ class Node(Stages):
         """
         if now >= self._promised or self.beat_at < self._promised or now >= self.rounds.next_deadline():
             return False
-        return self._todo.is_only_sent and not (self.tenure.is_busy or self.agreement.acceptor.has_parked)
+        is_waiting = self.tenure.is_busy or self.unconfirmed or self.agreement.acceptor.has_parked
+        return self._todo.is_only_sent and not is_waiting
 
     def _only_sent(self) -> tuple[do.Instruction, ...]:
         """The batch of an event that changed nothing here."""
@@ -140,10 +141,12 @@ class Node(Stages):
         todo, self._todo = self._todo, ToDo(must_beat=self._todo.must_beat, must_decide=self._todo.must_decide)
         if todo.stand_down is not None:
             todo.add(todo.stand_down)
-        # A limit that shrank may lie in the past already; that is no lag of this loop.
-        self._promised = max(self._next_deadline(now), now)
+        if todo.must_keep:
+            self.agreement.keep(now)
         state = self.agreement.to_persist(now) if todo.must_persist else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
+        # A limit that shrank may lie in the past already; that is no lag of this loop.
+        self._promised = max(self._next_deadline(now), now)
         if todo.send:
             todo.send = joined(todo.send, self.agreement.unsettled)
         self.behind_write = tuple(todo.apply) if first else ()
@@ -221,6 +224,8 @@ class Node(Stages):
         # Also where no task is exclusive any more: the question may have come while one was.
         self.agreement.acceptor.retry_parked(todo, now)
         self.tenure.tend_isolation(self.membership, todo, now)
+        if self.unconfirmed:
+            work.take_up(self, todo, now)
         for executor in self.executors.values():
             if now >= executor.next_deadline():
                 executor.tick(todo, now)
@@ -268,4 +273,4 @@ class Node(Stages):
                 todo.must_beat = True
                 todo.add(do.PublishLearnt(learnt=word))
         for value, reason in learnt:
-            work.carry_out(self, value, reason, todo, now)
+            work.take(self, value, reason, todo, now)

@@ -57,6 +57,7 @@ from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import CLOCK_IN_DOUBT, RESTS
 from zsched.core.vote.agreement import Agreement
+from zsched.core.vote.disks import Disks
 from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.voting import Votes
@@ -189,6 +190,9 @@ class Stages:
             flags=flags,
         )
         self.registers = self.agreement.registers
+        self.unconfirmed: dict[TaskId, tuple[str, bool]] = {}
+        """{task whose value is not carried out yet: (why it came about, whether it was known at the start)}."""
+        self.disks = Disks()
         self.retuning = Retuning(me)
         self.expiry = Expiry(rank=self.flags.rank)
         self.flags.take(self.agreement.flags, now)
@@ -396,6 +400,13 @@ class Stages:
         is_at_work = load is not None and (load.unended_s is not None or (load.jobs is not None and load.jobs.backlog))
         is_told = unready is not None and now - unready.since >= UNREADY_SHOWN_S
         return None if is_told or is_at_work else self.hangs.rhythms.overdue_s(task, value.epoch, now)
+
+    def tend_disks(self) -> None:
+        """Somebody has told how long a save takes: the clocks of votes leave room for it."""
+        pace_s = self.disks.pace_s(self.me, self.agreement.electors)
+        if pace_s != self.agreement.pace_s:
+            self.agreement.pace(pace_s)
+            self.votes.pace(self.agreement.timing)
 
     def counts_age_s(self, now: float) -> float:
         """For how long the relay has told no counts; 0 before the first."""

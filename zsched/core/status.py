@@ -104,6 +104,7 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
             *node.namesakes.problems(now),
             *_problems(node, quorum, now),
             *_overloads(node, now),
+            *_disk_problems(node),
             *_relay_problems(node, now),
             *node.knocking.problems(now, node.fleet_path, is_agreed=bool(node.agreement.document_hash)),
         ),
@@ -282,6 +283,17 @@ def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:
     if is_remembered or any(register.value.revision for register in node.registers.values()):
         return False
     return quorum.alive == 0 and quorum.electors - len(quorum.stateless) < quorum.needed
+
+
+def _disk_problems(node: Stages) -> Iterator[str]:
+    """Disks on which others wait, and those that refuse: an own refusal is told by the state's line."""
+    for name, save_s in node.disks.slow(node.me, node.fleet.timing.ballot_s / 2).items():
+        yield (
+            f"the disk of {name} is slow: a save takes {save_s:.2g} s, and a vote waits for two of them; "
+            f"put its state folder on another disk, or look what else writes there: iotop on {name}"
+        )
+    for name, why in node.disks.refusals().items():
+        yield f"the disk of {name} refuses what must be saved: {why}; then start zsched there anew"
 
 
 def _relay_problems(node: Stages, now: float) -> Iterator[str]:

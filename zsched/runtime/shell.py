@@ -148,7 +148,10 @@ class Shell:
         bus = self._bus
         match instruction:
             case do.PersistState(state=state):
+                began = monotonic_s()
                 self._state_file.save(state)
+                # Before any deadline is judged: whoever waits for other disks must know how slow this one was.
+                self._inbox.put_first(ev.StateSaved(took_s=monotonic_s() - began))
             case do.PublishBeat(beat=beat, is_news=is_news):
                 bus.publish("beat" if is_news else "beat_in_turn", beat)
             case do.PublishProfile(profile=profile, is_news=is_news):

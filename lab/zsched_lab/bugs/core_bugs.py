@@ -135,22 +135,22 @@ REGISTER_BUGS = (
     _bug(
         "promise not persisted",
         REGISTER,
-        "        todo.must_persist = True\n        return Promise(",
-        "        return Promise(",
+        "self._set_state(promised=prepare.ballot)\n            todo.must_persist = True",
+        "self._set_state(promised=prepare.ballot)",
         _REGISTER + _SCHEDULES,
     ),
     _bug(
         "acceptance not persisted",
         REGISTER,
-        "        todo.must_persist = True\n        return Accepted(",
-        "        return Accepted(",
+        "accepted=accept.acceptance)\n            todo.must_persist = True",
+        "accepted=accept.acceptance)",
         _REGISTER + _SCHEDULES,
     ),
     _bug(
-        "promise with >=",
+        "promises below its promise",
         REGISTER,
-        "prepare.ballot <= self.state.promised",
         "prepare.ballot < self.state.promised",
+        "prepare.ballot.counter < self.state.promised.counter - 9",
         _REGISTER,
     ),
     _bug(
@@ -224,9 +224,9 @@ REGISTER_BUGS = (
     ),
     _bug(
         "learnt value not persisted before routes",
-        REGISTER,
-        "        todo.must_persist = True\n        self._hand_on",
-        "        self._hand_on",
+        "zsched.core.register.task_register",
+        "return accepted is None or accepted.value.revision < value.revision",
+        "return False",
         _REGISTER,
     ),
     Bug(
@@ -532,8 +532,8 @@ LEASE_BUGS = (
     _bug(
         "identity round ends the silence",
         ACCEPTOR,
-        "if has_accepted and (known is None or value.revision > known.revision):",
-        "if has_accepted:",
+        "if isinstance(answer, Accepted) and (known is None or value.revision > known.revision):",
+        "if isinstance(answer, Accepted):",
         (*_LEASE, "tests/unit/core/vote/test_parked_accepts.py"),
     ),
     _bug(

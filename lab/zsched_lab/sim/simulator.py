@@ -92,7 +92,7 @@ class Simulator(Links):
     """More than this is a storm: nodes that answer each other without end."""
     answers: list[do.AnswerCommand] = field(default_factory=list)
     """What operators were told."""
-    _asked: dict[int, tuple[Machine, Machine, Make]] = field(default_factory=dict)
+    _asked: dict[int, tuple[Machine, Machine, Make, float]] = field(default_factory=dict)
     _frames: dict[tuple[str, type[Any]], tuple[object, bytes, Any]] = field(default_factory=dict)
     """{(sender, class): (the newest value of this class, its frame, what is read in it)}."""
     _disks: Iterator[int] = field(default_factory=lambda: itertools.count(1))
@@ -358,8 +358,9 @@ class Simulator(Links):
                     break
                 machine.disk.write(instruction.state)
                 if machine.disk_s[1] > 0.0:
-                    machine.busy_until = self.now + self.rng.uniform(*machine.disk_s)
-                    self.later(machine.busy_until - self.now, self._synced, machine, life, batch, index, end)
+                    took_s = self.rng.uniform(*machine.disk_s)
+                    machine.busy_until = self.now + took_s
+                    self.later(took_s, self._synced, machine, life, batch, index, end, took_s)
                     return
                 self._sync(machine, instruction.state)
                 continue
@@ -380,19 +381,21 @@ class Simulator(Links):
         machine.disk.sync()
 
     def _synced(
-        self, machine: Machine, life: int, batch: tuple[do.Instruction, ...], index: int, end: int | None
+        self, machine: Machine, life: int, batch: tuple[do.Instruction, ...], index: int, end: int | None, took_s: float
     ) -> None:
         if machine.life != life:
             return
         persist = batch[index]
         assert isinstance(persist, do.PersistState)
         if machine.is_paused:  # the write is done, the process is not there to go on
-            self.later(TICK_S, self._synced, machine, life, batch, index, end)
+            self.later(TICK_S, self._synced, machine, life, batch, index, end, took_s)
             machine.busy_until = self.now + TICK_S
             return
         self._sync(machine, persist.state)
         machine.busy_until = self.now
         self._do(machine, life, batch, index + 1, end)
+        if machine.life == life:
+            self.absorb(machine, ev.StateSaved(took_s=took_s))
         self.pump_later(machine)
         self.arm(machine)
 
@@ -408,14 +411,19 @@ class Simulator(Links):
                 self._put(me, learnt, lambda value: ev.LearntReceived(learnt=value))
             case do.AskUtilities(gather=gather):
                 self._gather(me, gather)
-            case do.SendPrepare(prepare=prepare):
-                self._elect(me, prepare, lambda n, value: ev.PrepareAsked(request=n, asker=me.name, prepare=value))
-            case do.SendAccept(accept=accept):
-                self._elect(me, accept, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value))
-            case do.SendBallots(ballots=ballots):
+            case do.SendPrepare(prepare=prepare, deadline_s=deadline_s):
+                self._elect(
+                    me, prepare, deadline_s, lambda n, value: ev.PrepareAsked(request=n, asker=me.name, prepare=value)
+                )
+            case do.SendAccept(accept=accept, deadline_s=deadline_s):
+                self._elect(
+                    me, accept, deadline_s, lambda n, value: ev.AcceptAsked(request=n, asker=me.name, accept=value)
+                )
+            case do.SendBallots(ballots=ballots, deadline_s=deadline_s):
                 self._elect(
                     me,
                     ballots,
+                    deadline_s,
                     lambda n, value: ev.BallotsAsked(request=n, asker=me.name, ballots=value),
                     lambda answer: ev.VotesReceived(votes=answer),
                 )
@@ -492,10 +500,13 @@ class Simulator(Links):
                 asked = ev.FleetAsked(request=number, asker=me.name, question=read)
                 self.send(me, other, Message(asked, frame, FleetQuestion))
 
-    def ask(self, asked: Machine, asker: Machine, make: Make) -> int:
-        """A request number whose answers travel back from ``asked`` to ``asker`` (a repeated question's, too)."""
+    def ask(self, asked: Machine, asker: Machine, make: Make, within_s: float = math.inf) -> int:
+        """A request number whose answers travel back from ``asked`` to ``asker`` (a repeated question's, too).
+
+        What is answered later than ``within_s`` is heard by nobody: the query is over.
+        """
         number = next(self._requests)
-        self._asked[number] = (asked, asker, make)
+        self._asked[number] = (asked, asker, make, self.now + within_s)
         if len(self._asked) > QUESTIONS_KEPT:
             del self._asked[next(iter(self._asked))]
         return number
@@ -504,7 +515,9 @@ class Simulator(Links):
         question = self._asked.get(request)
         if question is None:
             return
-        asked, asker, make = question
+        asked, asker, make, until = question
+        if self.now > until:
+            return
         frame, read = self._framed(asked, value)
         self.send(asked, asker, Message(make(read), frame, type(value)))
 
@@ -523,6 +536,7 @@ class Simulator(Links):
         self,
         me: Machine,
         question: object,
+        deadline_s: float,
         make: Callable[[int, Any], ev.Event],
         answered: Make = lambda answer: ev.ElectorAnswered(answer=answer),
     ) -> None:
@@ -530,7 +544,7 @@ class Simulator(Links):
         assert me.node is not None
         for elector in me.node.agreement.electors:
             for other in self.named(elector):
-                number = self.ask(other, me, answered)
+                number = self.ask(other, me, answered, deadline_s)
                 self.send(me, other, Message(make(number, value), frame, kind))
 
 

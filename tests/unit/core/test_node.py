@@ -11,7 +11,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
-from support.beats import beat_of
+from support.beats import beat_of, hear
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import SAMPLE, load_of, profile_of
 from support.proposals import proposal_of, vector_of
@@ -311,11 +311,46 @@ def test_learnt_values_apply_on_a_node_without_state_too() -> None:
 
 
 def test_restart_carries_out_again_what_was_learnt() -> None:
-    batch = make("edge1", learnt=allocation_of(4, "edge1", 2)).start(100.0)
-    assert of(batch, do.StartWorker)
-    assert [one.role.epoch for one in of(batch, do.SetRole)] == [2]
     (plan,) = of(make("robot1", learnt=allocation_of(4, "edge1", 2)).start(100.0), do.ApplyRoutes)
     assert plan.plan.phase is RoutePhase.PREPARE
+
+
+def test_a_restarted_owner_is_told_its_role_once_a_majority_is_heard_and_knows_nothing_newer() -> None:
+    """What it has stored may be older than a move that was made while it was away."""
+    node = make("edge1", learnt=allocation_of(4, "edge1", 2))
+    assert not of(node.start(100.0), do.SetRole)
+    assert not of(node.handle(ev.BeatReceived(beat=beat("robot1", revision=4)), 100.1), do.SetRole)
+    told = node.handle(ev.BeatReceived(beat=beat("robot2", revision=4)), 100.2)
+    assert [(one.role.role, one.role.epoch) for one in of(told, do.SetRole)] == [(WorkerRole.ACTIVE, 2)]
+
+
+def test_a_restarted_owner_that_was_replaced_is_never_told_to_be_active() -> None:
+    node = make("edge1", learnt=allocation_of(4, "edge1", 2))
+    batches = [node.start(100.0)]
+    for name, revision in (("robot1", 4), ("robot2", 5), ("robot3", 5)):
+        batches.append(node.handle(ev.BeatReceived(beat=beat(name, revision=revision)), 100.1))
+    batches.append(node.handle(learnt_from("robot2", allocation_of(5, "edge2", 3)), 100.2))
+    roles = [one.role.role for batch in batches for one in of(batch, do.SetRole)]
+    assert roles == [WorkerRole.IDLE]
+
+
+def test_an_elector_acts_on_nothing_older_than_it_has_accepted() -> None:
+    """A value that is learnt of what this disk has accepted is written later: a restart finds the one before."""
+    held = Acceptance(ballot=ballot(9, "robot2"), value=allocation_of(5, "edge2", 3))
+    state = RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=allocation_of(4, "edge1", 2))
+    node = Node(
+        fleet=FLEET,
+        me="robot1",
+        durable=durable("robot1", state),
+        incarnation=7,
+        electorate=ELECTORATE,
+        rng=Random(1),
+        now=100.0,
+    )
+    assert not of(node.start(100.0), do.ApplyRoutes)
+    (plan,) = of(node.handle(learnt_from("robot2", held.value), 100.1), do.ApplyRoutes)
+    assert plan.plan.current is not None
+    assert plan.plan.current.owner == "edge2"
 
 
 def learnt_from(peer: str, value: Allocation) -> ev.LearntReceived:
@@ -370,6 +405,7 @@ def test_who_has_not_committed_a_move_tells_the_reason_of_one_that_wanted_it() -
 def test_of_a_peers_first_news_only_the_first_placement_is_a_move(epoch: int, is_known: bool) -> None:
     node = make("edge1", creation=epoch // CREATION_STEP)
     node.start(100.0)
+    hear(node, *ROBOTS, now=100.0)
     batch = node.handle(learnt_from("robot2", allocation_of(epoch, "edge1")), 100.0)
     assert moves_in(batch) == [(None, "edge1", epoch, is_known)]
     assert any("first news here" in one.text for one in of(batch, do.RecordStory)) is is_known

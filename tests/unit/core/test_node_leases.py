@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from support.allocations import allocation_of
-from support.beats import beat_of
+from support.beats import beat_of, hear
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from zsched.core import events as ev
@@ -40,6 +40,7 @@ class Owner:
             fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
         )
         self.node.start(100.0)
+        hear(self.node, *ROBOTS[1:], now=100.0)
         self.now, self.sequence = 100.0, 0
         self.sent: dict[int, float] = {}
         """{number of a beat: when it left}."""
@@ -204,6 +205,7 @@ def test_a_worker_that_was_not_ready_when_it_was_told_to_stop_works_without_a_le
     state = state_of("robot1", RegisterState(task="guard"))
     node = Node(fleet=by_old_file, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
     node.start(100.0)
+    hear(node, *ROBOTS[1:], now=100.0)
     node.handle(ev.WorkerChanged(task="guard", state=WorkerState.STARTING), 100.0)
     for new in (replace(value(4), leased=False), replace(value(5), epoch=4)):
         learnt = Learnt(node="robot2", values=(new,))

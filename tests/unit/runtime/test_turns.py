@@ -206,7 +206,7 @@ def ballot(monkeypatch: pytest.MonkeyPatch) -> tuple[Loop, list[ev.Event], Prepa
 
 
 def test_a_ballot_goes_on_whose_answers_wait_behind_a_slow_write(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two others have promised in time, and that is enough."""
+    """Two others have promised, and that is enough, whether the deadline is judged before their answers or after."""
     for is_hasty in (False, True):
         loop, promises, _ = ballot(monkeypatch)
         for event in promises:
@@ -215,7 +215,7 @@ def test_a_ballot_goes_on_whose_answers_wait_behind_a_slow_write(monkeypatch: py
             else:
                 loop.inbox.post(event)
         loop.turn()
-        assert any(isinstance(one, do.SendAccept) for one in loop.done) is not is_hasty
+        assert any(isinstance(one, do.SendAccept) for one in loop.done)
 
 
 def test_what_a_node_asks_does_not_wait_for_what_it_writes_for_others(monkeypatch: pytest.MonkeyPatch) -> None:

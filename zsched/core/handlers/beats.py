@@ -60,6 +60,8 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         gone=gone,
         away=away,
         may_return=node.agreement.may_return,
+        save_s=min(node.disks.save_s, 86400.0),
+        disk_refusal=node.disks.refusal,
     )
     node.loop_lag_s = 0.0
     beat = node.pace.marked(beat, now, is_restless=is_news or is_restless(node, now))
@@ -153,6 +155,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
         node.agreement.witness.on_twin()
         if node.identity.must_ask(beat.node, now):
             _ask(node, beat.node, todo)
+    if node.disks.hear(beat):
+        node.tend_disks()
     node.agreement.compare(beat, todo, now)
     if node.membership.is_newest(beat.node):
         node.agreement.hear_pilot(beat, now)

@@ -102,6 +102,8 @@ def _adopt_choice(node: Stages, fleet: Fleet, anew: AbstractSet[TaskId], todo: T
     node.votes.adopt(fleet)
     node.rounds.adopt(fleet, now, anew)
     node.agreement.adopt(fleet, todo, now)
+    node.votes.pace(node.agreement.timing)
+    node.unconfirmed = {name: why for name, why in node.unconfirmed.items() if name in node.registers}
     past = {name: told for name, told in node.history.items() if name not in anew}
     node.history = {task.name: past.get(task.name) or deque(maxlen=HISTORY) for task in fleet.tasks}
 

@@ -13,9 +13,11 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import UNREADY_SHOWN_S, Handler, PastValue, Stages, Unready
+from zsched.core.status import has_quorum
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
-from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, told_by
+from zsched.core.values.fleet import OnIsolation
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, as_reason, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.words import CREATION_STEP, HAS_RESTED, TOO_FEW_ELECTORS, shown
@@ -65,6 +67,37 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
         if node.membership.state(old) is PeerState.GONE:
             executor.on_gone(old, todo)
     todo.must_beat = True
+
+
+def take(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float, *, is_known: bool = False) -> None:
+    """Carry out a learnt value, or keep it until it may be."""
+    node.unconfirmed.pop(value.task, None)
+    if is_confirmed(node, value):
+        carry_out(node, value, reason, todo, now, is_known=is_known)
+    else:
+        node.unconfirmed[value.task] = reason, is_known
+
+
+def take_up(node: Stages, todo: ToDo, now: float) -> None:
+    """Carry out what had to wait and is confirmed by now."""
+    for task, (reason, is_known) in tuple(node.unconfirmed.items()):
+        take(node, node.registers[task].value, reason, todo, now, is_known=is_known)
+
+
+def is_confirmed(node: Stages, value: Allocation) -> bool:
+    """Whether a value may be carried out: this node has accepted no newer one. Where it is the owner, that is not all.
+
+    What is stored here may be older than the last move: a majority of the electors is heard, since the start, and
+    nobody who is heard knows a newer value. A robot that may work alone does so once it has listened in vain.
+    """
+    if node.registers[value.task].is_unlearnt:
+        return False
+    if value.owner != node.me:
+        return True
+    if any(revision > value.revision for revision in node.membership.told(value.task)):
+        return False
+    may_be_alone = node.fleet.task(value.task).on_isolation is OnIsolation.LOCAL and node.membership.has_watched
+    return node.quorum_at > node.started_at or has_quorum(node) or may_be_alone
 
 
 def _is_first_news(epoch: int, value: Allocation, reason: str) -> bool:
@@ -272,8 +305,14 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
         node.counters["relay_exits"] += 1
 
 
+def _on_saved(node: Stages, event: ev.StateSaved, _todo: ToDo, _now: float) -> None:
+    node.disks.on_saved(event.took_s)
+    node.tend_disks()
+
+
 def _on_persist_failed(node: Stages, event: ev.PersistFailed, todo: ToDo, _now: float) -> None:
     """The disk refused. What happens on this machine goes on: these of the cut-off instructions are given again."""
+    node.disks.refusal = as_reason(event.reason)
     node.agreement.on_persist_failed(event.reason)
     todo.add(*node.behind_write)
 
@@ -290,5 +329,6 @@ HANDLERS: Final[Mapping[type[Any], Handler]] = {
     ev.RoleEnded: _on_role_ended,
     ev.StreamsCounted: _on_counted,
     ev.RelayChanged: _on_relay,
+    ev.StateSaved: _on_saved,
     ev.PersistFailed: _on_persist_failed,
 }

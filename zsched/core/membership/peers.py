@@ -23,12 +23,12 @@ owner that all others hear.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from zsched.core.sequence import Order, Track
 from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
-from zsched.core.values.model import NodeId, PeerState
+from zsched.core.values.model import NodeId, PeerState, TaskId
 from zsched.core.values.struct import Struct, field
 
 NEW_TIMES = 2.0
@@ -81,6 +81,8 @@ class _Peer(Struct):
     """When it last came back from gone in the same life."""
     accuses: Mapping[NodeId, float] = field(default_factory=dict)
     """{node that it suspects or takes for gone: since when its beats say so}."""
+    learnt: tuple[tuple[TaskId, int, int], ...] = ()
+    """What its newest beat says of values (`Beat.learnt`)."""
     accused_before: Mapping[NodeId, float] = field(default_factory=dict)
     """The same of its life before: one that has just started accuses nobody, because it is new."""
     is_new_until: float = -math.inf
@@ -103,7 +105,7 @@ class Membership:
         self._was_lossy = False
         self._started_at = math.inf
         self._has_heard = False
-        self._has_watched = False
+        self.has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
 
         self.adopt(nodes, timing)
@@ -144,6 +146,11 @@ class Membership:
         peer = self._peers.get(node)
         return None if peer is None or peer.track.incarnation < 0 else peer.track.incarnation
 
+    def told(self, task: TaskId) -> Iterator[int]:
+        """The revisions of a task that living peers have learnt, by their newest beats."""
+        living = (peer for peer in self._peers.values() if peer.state is PeerState.ALIVE)
+        return (revision for peer in living for name, revision, _ in peer.learnt if name == task)
+
     def is_doubtful(self, node: NodeId) -> bool:
         """Whether the peer's last beat is not believed."""
         return self._peers[node].order is Order.DOUBTFUL
@@ -165,7 +172,7 @@ class Membership:
 
     def suspects(self) -> tuple[NodeId, ...]:
         """The nodes that this node accuses: suspect, gone, or never heard after it has listened for long enough."""
-        excused = (PeerState.ALIVE,) if self._has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
+        excused = (PeerState.ALIVE,) if self.has_watched else (PeerState.ALIVE, PeerState.UNKNOWN)
         return tuple(name for name, peer in self._peers.items() if peer.state not in excused)
 
     def misses(self, observer: NodeId, node: NodeId, now: float, for_s: float) -> bool:
@@ -178,7 +185,7 @@ class Membership:
             if peer is None or peer.state is PeerState.ALIVE:
                 return False
             is_young = peer.state is PeerState.SUSPECT and now < peer.suspect_since + for_s
-            return not is_young and (self._has_watched or peer.state is not PeerState.UNKNOWN)
+            return not is_young and (self.has_watched or peer.state is not PeerState.UNKNOWN)
         told = self._peers.get(observer)
         if told is None or told.state is not PeerState.ALIVE:
             return False
@@ -251,7 +258,7 @@ class Membership:
         if restarted:
             peer.accused_before, peer.is_new_until = peer.accuses, now + NEW_TIMES * self._timing.suspect_s
         peer.accuses = {name: peer.accuses.get(name, now) for name in beat.suspects}
-        peer.token_lost = False
+        peer.learnt, peer.token_lost = beat.learnt, False
         if known == beat.incarnation and beat.sequence == sequence + 1:
             self._note_way(silent_s, beat.loop_lag_s, now)
         peer.is_calm, peer.has_missed = beat.calm, sequence >= 0 and not restarted and beat.sequence > sequence + 1
@@ -324,7 +331,7 @@ class Membership:
         changes = []
         limit = self._timing.suspect_s * self._lag_factor
         self._started_at = min(self._started_at, now)
-        self._has_watched = self._has_watched or now >= self._started_at + limit
+        self.has_watched = self.has_watched or now >= self._started_at + limit
         if now < self.next_deadline():
             return ()  # silence and reviews have their times; a peer's word is reviewed when it comes
         self._deadline = None

@@ -5,7 +5,8 @@ few things that a round needs of it), who won which vote, how anything travels o
 
 Synod on a register that can be rewritten (Rystsov, arXiv 1802.07000): no leader, no log. The rules that keep it safe:
 
-* an elector's promise and acceptance are persisted before the answer leaves (`ToDo.must_persist`);
+* an elector's promise and acceptance are persisted before the answer leaves (`ToDo.must_persist`); the same question
+  again is the same answer, without a write, so a proposer that waits asks it again and keeps its ballot;
 * a ballot carries exactly one value: a proposer that reads an accepted value it has not learnt re-accepts that one, and
   its own change follows under a higher ballot;
 * where too many electors refuse that value for good (their fleet files know no such node), a change that its register
@@ -40,6 +41,8 @@ FROM_A_PEER = "learnt from a peer"
 """Why a value came about that another node committed."""
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
+ROUND_BALLOTS = 6
+"""A change is given up so many times ``ballot_s`` after it began."""
 MAX_QUEUED = 16
 """Changes that may wait for the round under way; one more ends as a conflict, for those before it come first."""
 
@@ -151,7 +154,13 @@ class Register(ABC, Generic[V]):
         self.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)
 
     def adopt_clocks(self, *, ballot_s: float, stagger_s: float) -> None:
-        """Go by other clocks from the next phase on (arguments as of `adopt`)."""
+        """Go by other clocks from the next phase on (arguments as of `adopt`): what is under way has more time, or less.
+
+        What was asked by the old ones is asked again when it was due: answers to it may have come too late.
+        """
+        self._settle_at += 2 * (ballot_s - self._ballot_s)
+        if self._round is not None:
+            self._round.give_up_at += ROUND_BALLOTS * (ballot_s - self._ballot_s)
         self._ballot_s, self._stagger_s = ballot_s, stagger_s
 
     def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
@@ -193,6 +202,11 @@ class Register(ABC, Generic[V]):
     def _prevails(self, value: V) -> bool:
         """Whether ``value`` counts more than another first value, which no ballot has brought."""
 
+    def _must_write(self, value: V) -> bool:
+        """Whether a learnt value is on disk before anything follows from it, rather than soon (`ToDo.must_keep`)."""
+        del value
+        return True
+
     @abstractmethod
     def _replaces(self, change: Rewrite[V]) -> bool:
         """Whether ``change`` may be applied to a value that no majority of electors takes."""
@@ -223,12 +237,13 @@ class Register(ABC, Generic[V]):
     def on_prepare(self, prepare: Prepare, todo: ToDo) -> Promise[V] | Refused:
         """Phase 1b. A promise must not leave before it is on disk."""
         refusal = self._refusal(prepare, prepare.ballot)
-        if refusal is None and prepare.ballot <= self.state.promised:
+        if refusal is None and prepare.ballot < self.state.promised:
             refusal = Refusal.BALLOT
         if refusal is not None:
             return self._no(prepare.ballot, refusal)
-        self._set_state(promised=prepare.ballot)
-        todo.must_persist = True
+        if prepare.ballot != self.state.promised:  # else it is asked again, and the promise is on disk already
+            self._set_state(promised=prepare.ballot)
+            todo.must_persist = True
         return Promise(
             elector=self._me,
             task=self.state.task,
@@ -256,11 +271,12 @@ class Register(ABC, Generic[V]):
             refusal = Refusal.BALLOT
         if refusal is not None:
             return self._no(ballot, refusal)
-        self._set_state(promised=ballot, accepted=accept.acceptance)
+        if accept.acceptance != self.state.accepted:  # else it is asked again, and on disk already
+            self._set_state(promised=ballot, accepted=accept.acceptance)
+            todo.must_persist = True
         if self._is_unlearnt():
             self._settle_tries = 0
             self._settle_at = now + 2 * self._ballot_s + self._jitter(0)
-        todo.must_persist = True
         return Accepted(elector=self._me, task=self.state.task, ballot=ballot, disk=self._disk, joining=self._joining)
 
     @property
@@ -336,7 +352,8 @@ class Register(ABC, Generic[V]):
         if not self._is_unlearnt():
             self._settle_at = math.inf
         outcome = self._outcome_by(value)
-        todo.must_persist = True
+        todo.must_persist |= self._must_write(value)
+        todo.must_keep = True
         self._hand_on(value, self._why(outcome), todo)
         if outcome is not None:
             self._finish(todo, outcome, now)
@@ -388,7 +405,7 @@ class Register(ABC, Generic[V]):
             self.propose(change, todo, now)
             return
         running.change, running.is_ahead = change, False
-        running.give_up_at = now + 6 * self._ballot_s
+        running.give_up_at = now + ROUND_BALLOTS * self._ballot_s
         if self._outcome_by(self.value) is not None:
             self._finish(todo, RoundOutcome.CONFLICT, now)
         elif running.phase is _Phase.HELD:
@@ -401,7 +418,7 @@ class Register(ABC, Generic[V]):
         one has overtaken it, the change is refused, and its end may be unknown: who wants it looks, and tries again.
         """
         if self._round is None:
-            self._round = _Round(change=None, give_up_at=now + 6 * self._ballot_s, is_ahead=True)
+            self._round = _Round(change=None, give_up_at=now + ROUND_BALLOTS * self._ballot_s, is_ahead=True)
             self._prepare(todo, now)
 
     def settle(self, todo: ToDo, now: float) -> None:
@@ -416,7 +433,7 @@ class Register(ABC, Generic[V]):
         """Begin with the next change that is not outdated; those before it end."""
         while self._queue and self._round is None:
             change = self._queue.pop(0)
-            self._round = _Round(change=change, give_up_at=now + 6 * self._ballot_s)
+            self._round = _Round(change=change, give_up_at=now + ROUND_BALLOTS * self._ballot_s)
             if self._outcome_by(self.value) is None:
                 self._prepare(todo, now)
             else:
@@ -426,13 +443,16 @@ class Register(ABC, Generic[V]):
     def _prepare(self, todo: ToDo, now: float) -> None:
         running = self._running()
         self._counter = max(self._counter, self.state.promised.counter) + 1
-        running.ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation, disk=self._id)
-        running.phase, running.deadline = _Phase.PREPARE, now + self._ballot_s
-        running.promises, running.yes, running.no, running.value = {}, {}, {}, None
+        ballot = Ballot(counter=self._counter, node=self._me, incarnation=self._incarnation, disk=self._id)
+        running.promises, running.yes, running.value, running.ballot = {}, {}, None, ballot
         running.known = self.value.revision
+        self._ask_promises(running, ballot, todo, now)
+
+    def _ask_promises(self, running: _Round[V], ballot: Ballot, todo: ToDo, now: float) -> None:
+        running.phase, running.deadline, running.no = _Phase.PREPARE, now + self._ballot_s, {}
         prepare = Prepare(
             task=self.state.task,
-            ballot=running.ballot,
+            ballot=ballot,
             electorate=self._electorate,
             creation=self.state.creation,
             generation_id=self._count.generation_id,
@@ -566,14 +586,19 @@ class Register(ABC, Generic[V]):
         return running.phase is _Phase.ACCEPT and passes.issuperset(running.no.values()) and bool(running.no)
 
     def _ask_again(self, running: _Round[V], todo: ToDo, now: float) -> None:
-        """Send the same accept again: a new ballot could only find out the outcome, without a move."""
+        """Send the same question again: who has answered by then, on however slow a disk, answers at once.
+
+        A new ballot would be another write everywhere, and of an accept it could only find out the outcome.
+        """
         if now >= running.give_up_at:
             self._give_up(running, todo, now)
             return
         assert running.ballot is not None
-        assert running.value is not None
         running.is_alone = True
-        self._accept(running, running.ballot, running.value, todo, now)
+        if running.value is None:
+            self._ask_promises(running, running.ballot, todo, now)
+        else:
+            self._accept(running, running.ballot, running.value, todo, now)
 
     def _accept(self, running: _Round[V], ballot: Ballot, value: V, todo: ToDo, now: float) -> None:
         running.phase, running.deadline, running.no = _Phase.ACCEPT, now + self._ballot_s, {}
@@ -620,14 +645,15 @@ class Register(ABC, Generic[V]):
         """Time has passed."""
         running = self._round
         if running is not None and now >= running.deadline:
+            running.give_up_at += now - running.deadline  # this loop stood still meanwhile, maybe in its own write
             if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, running.give_up_at)):
                 running.deadline = until  # our next ballot would end the accept that waits
             elif running.phase is _Phase.WAIT:
                 self._prepare(todo, now)  # no newer value has come: that would have ended the round
-            elif self._waits_for_others(running):
-                self._ask_again(running, todo, now)
+            elif running.phase is _Phase.HELD:
+                self._give_up(running, todo, now)
             else:
-                self._again(running, todo, now)
+                self._ask_again(running, todo, now)
         elif running is None and now >= self._settle_at:
             self._settle_tries += 1
             self._settle_at = now + 2 * self._ballot_s + self._jitter(self._settle_tries)

@@ -6,7 +6,7 @@ Knows: what a beat tells, and in which range. Does not know: when to beat, what 
 from __future__ import annotations
 
 from zsched.core.values.electorate import check_id
-from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
+from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
@@ -83,6 +83,11 @@ class Beat(Struct, frozen=True, kw_only=True):
     calm: bool = False
     """Nothing goes on at this node: its next beat may come at the slow pace (`zsched.core.membership.pace`)."""
 
+    save_s: float = 0.0
+    """How long a save of this node's state takes, of late; 0: next to nothing, or nothing was saved."""
+    disk_refusal: str = ""
+    """Why this node's disk refuses what must be saved; empty: it does not."""
+
     def __post_init__(self) -> None:
         check_name("beat.node", self.node)
         check_counter("beat.votes", self.votes)
@@ -91,5 +96,8 @@ class Beat(Struct, frozen=True, kw_only=True):
         check_counter("beat.incarnation", self.incarnation)
         check_counter("beat.sequence", self.sequence)
         check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)
+        check_range("beat.save_s", self.save_s, 0.0, 86400.0)
+        if len(self.disk_refusal) > MAX_REASON:
+            raise ValueError(f"beat.disk_refusal: {len(self.disk_refusal)} characters, at most {MAX_REASON}")
         check_counter("beat.generation", self.generation)
         check_id("beat.disk", self.disk)

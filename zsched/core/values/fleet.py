@@ -58,6 +58,8 @@ LEAST_ORDER_S, MOST_ORDER_S = 3.0, 60.0
 ORDER_BALLOTS = 14.0
 """And for so many times ``ballot_s``: a round is given up 6 of them after it began, and its last phase may take one
 more; a round that is under way is waited for first."""
+PACED_SAVES = 3.0
+"""A phase of a vote may take so many saves of the electors' disks."""
 SECONDS = Range(0.01, 3600, "s")
 DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 
@@ -366,6 +368,14 @@ class Timing:
     ballot_s: float = key(0.3, "Deadline of one prepare or accept phase.", SECONDS)
     stagger_s: float = key(0.03, "Wait per rank before a proposer starts.", Range(0, 10, "s"))
     lease_s: float = key(1.0, "Exclusive tasks: how long an owner may work on the echoes of one beat.", SECONDS)
+
+    def paced(self, save_s: float) -> Timing:
+        """The same, where a save takes ``save_s`` on a majority of the electors.
+
+        An answer may wait for a save that is under way and then for its own; the next proposer steps in behind both.
+        """
+        least_s = PACED_SAVES * save_s
+        return replace(self, ballot_s=max(self.ballot_s, least_s), stagger_s=max(self.stagger_s, least_s))
 
     @property
     def rest_beat_s(self) -> float:

@@ -101,8 +101,9 @@ class Acceptor:
         elif self.is_elector and not self.witness.may_vote(now):
             answer = register.refuse(ballot, Refusal.YOUNG)
         else:
+            before = register.state
             answer = register.on_prepare(event.prepare, todo)
-            self.witness.votes += isinstance(answer, Promise)
+            self.witness.votes += register.state is not before  # asked again, it is no other vote
         todo.add(do.AnswerElection(request=event.request, answer=answer))
 
     def on_fleet_asked(self, event: ev.FleetAsked, todo: ToDo, now: float, may_ask: bool | None = None) -> None:
@@ -124,9 +125,10 @@ class Acceptor:
             refusal = Refusal.VALUE
         elif self.is_elector and not self.witness.may_vote(now):
             refusal = Refusal.YOUNG
+        before = self._numbers.state
         answer = self._numbers.on_question(question, event.asker, todo, now, refusal)
         if answer is not None:
-            self.witness.votes += not isinstance(answer, Refused)
+            self.witness.votes += self._numbers.state is not before and not isinstance(answer, Refused)
             todo.add(do.AnswerFleet(request=event.request, answer=fleet_answer(answer)))
 
     def on_accept(self, event: ev.AcceptAsked, todo: ToDo, now: float, *, park_s: float | None = None) -> None:
@@ -165,13 +167,12 @@ class Acceptor:
             todo.add(do.AnswerElection(request=older[0].request, answer=self._leased(older[0])))
         value = accept.acceptance.value
         if not register.would_accept(accept) or self.leases.may_accept(accept.task, value.owner, now):
-            known = register.newest
+            known, before = register.newest, register.state
             answer = register.on_accept(accept, todo, now)
-            has_accepted = isinstance(answer, Accepted)
-            if has_accepted and (known is None or value.revision > known.revision):
+            if isinstance(answer, Accepted) and (known is None or value.revision > known.revision):
                 # An identity round's is none: the next owner may still wait.
                 self.leases.on_newer_value(value)
-            self.witness.votes += has_accepted
+            self.witness.votes += register.state is not before
             todo.add(do.AnswerElection(request=event.request, answer=answer))
         elif now >= deadline:
             todo.add(do.AnswerElection(request=event.request, answer=self._leased(event)))

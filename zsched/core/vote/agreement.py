@@ -27,7 +27,7 @@ from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import TOLD_DIGITS, Creation, Elector, FleetValue, terms_of
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet, TaskSpec, Timing
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
     Accepted,
@@ -84,6 +84,7 @@ class Agreement:
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
         self._fleet, self._me = fleet, me
+        self._timing, self.pace_s = fleet.timing, 0.0
         self._nodes = frozenset(node.name for node in fleet.nodes)
         self._durable = durable
         self.generation = None if durable is None else durable.generation
@@ -150,6 +151,8 @@ class Agreement:
             may_elect = durable is not None and not self._disputed and not self._lost
             self._numbers.begin(self.generation, self._by_file, self.at_start, now, may_elect=may_elect)
         self._settle_at = now + SETTLE_AFTER_START_S if is_elector else math.inf
+        self._keep_at = math.inf
+        """When what was learnt is written at the latest."""
         self._questions = Questions()
         self.leases = Leases(
             fleet=fleet,
@@ -210,6 +213,8 @@ class Agreement:
         The roll has the registers of an agreed document already. By a file, the state of a register whose task goes is
         kept, for the task may come back.
         """
+        self._timing = fleet.timing
+        fleet = replace(fleet, timing=fleet.timing.paced(self.pace_s))
         self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
         self.witness.nodes = self._nodes
         self._numbers.adopt(fleet)
@@ -239,6 +244,21 @@ class Agreement:
         self._seen = []
         self.leases.adopt(fleet, self.standing() if self.is_elector else {}, now)
         todo.must_persist |= self.must_persist
+
+    @property
+    def timing(self) -> Timing:
+        """The clocks by which this node votes."""
+        return self._fleet.timing
+
+    def pace(self, save_s: float) -> None:
+        """Go by clocks that leave room for saves of ``save_s``."""
+        self.pace_s, timing = save_s, self._timing.paced(save_s)
+        self._fleet = replace(self._fleet, timing=timing)
+        self._numbers.adopt(self._fleet)
+        self.helm.adopt(stagger_s=HELM_BALLOTS * timing.ballot_s)
+        self.acceptor.adopt(self._fleet)
+        for register in self.registers.values():
+            register.adopt_clocks(ballot_s=timing.ballot_s, stagger_s=timing.stagger_s)
 
     @property
     def _by_file(self) -> str:
@@ -312,7 +332,7 @@ class Agreement:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
-        due = min(self._settle_at, self._numbers.next_deadline())
+        due = min(self._settle_at, self._keep_at, self._numbers.next_deadline())
         for register in self.registers.values():
             if (at := register.next_deadline()) < due:
                 due = at
@@ -332,10 +352,16 @@ class Agreement:
         """{task: the newest value here}: an elector that does not know when it granted accepts only this owner."""
         return {name: register.newest for name, register in self.registers.items()}
 
+    def keep(self, now: float) -> None:
+        """Something is learnt that must be on disk once the vote about it is over: a write now would hold that up."""
+        if self._durable is not None:
+            self._keep_at = min(self._keep_at, now + 2 * self.timing.ballot_s)
+
     def to_persist(self, now: float) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""
         if self._durable is None:
             return None
+        self._keep_at = math.inf
         states = tuple(self.registers[name].state for name in sorted(self.registers))
         self._durable = replace(
             self._durable,
@@ -821,6 +847,7 @@ class Agreement:
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
+        todo.must_persist |= now >= self._keep_at
         if now >= self._settle_at:
             self._numbers.settle(todo, now)
         if now >= self._numbers.next_deadline():
@@ -851,7 +878,7 @@ class Agreement:
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""
         self._problems["state"] = f"{reason}; this node is no elector until it is restarted"
-        self._durable = None
+        self._durable, self._keep_at = None, math.inf
         self._stop_electing()
 
     def _stop_electing(self) -> None:

@@ -50,6 +50,7 @@ class Voting:
         self.commit: MoveOwner | None = None
         """The change that this robot will or does propose to the register."""
         self.commit_at = math.inf
+        self._commit_rank = 0
         self.awaited_until = -math.inf
         """A vote on a move was won: until when its value should be learnt."""
         self.adopt(fleet)
@@ -59,6 +60,11 @@ class Voting:
         self._voters, self._timing = fleet.voters, fleet.timing
         self._vote_s = vote_time(fleet.timing)
         self.proposals = {voter: known for voter, known in self.proposals.items() if voter in self._voters}
+
+    def pace(self, timing: Timing) -> None:
+        """The clocks of a vote have changed, also that of a commit which waits for those of a better rank."""
+        self.commit_at += (timing.stagger_s - self._timing.stagger_s) * self._commit_rank
+        self._timing = timing
 
     def next_deadline(self) -> float:
         """When a commit is due or the open vote ends; infinity when neither."""
@@ -153,7 +159,8 @@ class Voting:
         if self._me not in supporters or counted.winner is None:
             return
         self.commit = MoveOwner(base_revision=allocation.revision, owner=counted.winner, reason=fresh[self._me].reason)
-        self.commit_at = now + self._timing.stagger_s * supporters.index(self._me)
+        self._commit_rank = supporters.index(self._me)
+        self.commit_at = now + self._timing.stagger_s * self._commit_rank
 
     # --- the commit ----------------------------------------------------------------------------------------------
 
@@ -192,6 +199,11 @@ class Votes:
         for spec in fleet.tasks:
             voting = self.tasks[spec.name] = kept.get(spec.name) or Voting(fleet, self._me)
             voting.adopt(fleet)
+
+    def pace(self, timing: Timing) -> None:
+        """The clocks of votes have changed."""
+        for voting in self.tasks.values():
+            voting.pace(timing)
 
     def next_deadline(self) -> float:
         """When a commit is due or an open vote ends; infinity when neither."""

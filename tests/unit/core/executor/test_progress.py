@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from support.allocations import allocation_of
-from support.beats import beat_of
+from support.beats import beat_of, hear
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import profile_of
 from support.states import state_of
@@ -281,6 +281,7 @@ def node_of(name: str) -> Node:
     state = state_of(name, RegisterState(task="merge", learnt=learnt), electorate=electorate)
     node = Node(fleet=fleet, me=name, durable=state, incarnation=7, electorate=electorate, rng=Random(1), now=100.0)
     node.start(100.0)
+    hear(node, *(one.name for one in fleet.nodes if one.name != name), now=100.0)
     return node
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.ballots import ballot_of
+from support.beats import hear
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import SAMPLE, load_of, profile_of
 from support.states import state_of
@@ -239,6 +240,7 @@ def test_a_foreign_worker_of_a_node_that_is_no_candidate_any_more_is_in_its_prof
     task = task_of(worker=WorkerSpec())
     node = node_of(fleet_of(task), "edge1")
     node.start(START)
+    hear(node, *node.fleet.electors, now=START)
     node.handle(ev.WorkerChanged(task="merge", state=WorkerState.READY), START)
     for revision, owner in ((1, "edge1"), (2, "edge2")):
         told = Learnt(node="robot1", values=(allocation_of(revision, owner),))

@@ -51,11 +51,10 @@ def test_prepare_higher_ballot_is_promised_and_persisted_first() -> None:
     assert answer == Promise(elector="r1", task="merge", ballot=ballot(1))
 
 
-@pytest.mark.parametrize("counter", [4, 5])
-def test_prepare_needs_a_strictly_greater_ballot(counter: int) -> None:
+def test_prepare_below_the_promise_is_refused() -> None:
     register = make()
     promised(register, prepare(5))
-    step, answer = promised(register, prepare(counter))
+    step, answer = promised(register, prepare(4))
     assert isinstance(answer, Refused)
     assert (answer.refusal, answer.promised) == (Refusal.BALLOT, ballot(5))
     assert not step.is_dirty
@@ -84,10 +83,12 @@ def test_a_prepare_or_accept_that_is_said_again_changes_nothing() -> None:
     promised(register, old[0])
     accepted(register, old[1], 0.0)
     before = register.state
-    _, answer = promised(register, old[0])
-    assert isinstance(answer, Refused)
-    _, again = accepted(register, old[1], 9.0)
+    step, answer = promised(register, old[0])
+    assert answer == Promise(elector="r1", task="merge", ballot=ballot(2), accepted=old[1].acceptance)
+    assert not step.is_dirty
+    step, again = accepted(register, old[1], 9.0)
     assert again == Accepted(elector="r1", task="merge", ballot=ballot(2))
+    assert not step.is_dirty
     assert register.state == before
     promised(register, prepare(3))
     accepted(register, accept(3, allocation(2)), 9.0)
@@ -95,6 +96,18 @@ def test_a_prepare_or_accept_that_is_said_again_changes_nothing() -> None:
     assert isinstance(promised(register, old[0])[1], Refused)
     assert isinstance(accepted(register, old[1], 9.0)[1], Refused)
     assert register.state == newer
+
+
+@pytest.mark.parametrize(("held", "is_dirty"), [(1, False), (None, True)], ids=["accepted", "not accepted"])
+def test_what_is_learnt_is_written_at_once_unless_it_is_accepted_on_this_disk(
+    held: int | None, *, is_dirty: bool
+) -> None:
+    register = make()
+    if held is not None:
+        accepted(register, accept(1, allocation(held)), 0.0)
+    todo = ToDo()
+    register.learn(allocation(1), todo, 0.0)
+    assert (todo.must_persist, todo.must_keep) == (is_dirty, True)
 
 
 def test_accept_under_a_higher_ballot_than_promised_raises_the_promise() -> None:
@@ -185,10 +198,10 @@ def test_crash_between_promise_and_acceptance_cannot_commit_two_values() -> None
 # --- learner and identity rounds -------------------------------------------------------------------------------------
 
 
-def test_learn_only_rises_and_is_persisted_before_it_is_applied() -> None:
+def test_learn_only_rises() -> None:
     register = make("edge")
     step = did(register.learn, allocation(2), 0.0)
-    assert (step.is_dirty, step.learnt) == (True, allocation(2))
+    assert step.learnt == allocation(2)
     assert did(register.learn, allocation(1, "e9"), 0.0) == Step()
     assert did(register.learn, allocation(2), 0.0) == Step()
     assert make("edge", state=register.state, incarnation=2).value == allocation(2)

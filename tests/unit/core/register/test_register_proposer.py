@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
@@ -35,7 +36,7 @@ from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner, Retune, RoundOutcome
 from zsched.core.values.electorate import Elector, Electorate
 from zsched.core.values.fleet import Timing
-from zsched.core.values.messages import Accepted, Promise, Refusal, Refused
+from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation
 
 # --- proposer --------------------------------------------------------------------------------------------------------
@@ -46,7 +47,6 @@ def test_move_commits_by_a_majority_and_is_learnt() -> None:
     step = commit(electors[0], did(electors[0].propose, FIRST, 0.0), electors[:2])
     assert step.finished == (FIRST, RoundOutcome.COMMITTED)
     assert step.learnt == allocation(1)
-    assert step.is_dirty
     assert electors[0].value == allocation(1)
     assert not electors[0].is_busy
 
@@ -107,11 +107,35 @@ def test_answers_to_an_older_ballot_change_nothing() -> None:
     old = did(proposer.propose, FIRST, 0.0).prepare
     assert old is not None
     late = [promised(other, old)[1] for other in others]
-    did(proposer.tick, BALLOT_S)
+    overtake(proposer, others, old)
     again = did(proposer.tick, proposer.next_deadline()).prepare
     assert again is not None
     assert again.ballot > old.ballot
     assert [did(proposer.on_answer, one, 1.0) for one in late] == [Step(), Step()]
+
+
+def test_a_proposer_that_waits_for_slow_disks_keeps_its_ballot() -> None:
+    """Who wrote its answer too late for the first question has it when the same one comes again."""
+    proposer, others = make("r1"), (make("r2"), make("r3"))
+    asked = did(proposer.propose, FIRST, 0.0)
+    assert asked.prepare is not None
+    for other in others:
+        promised(other, asked.prepare)  # heard by nobody
+    again = did(proposer.tick, BALLOT_S)
+    assert again.prepare == asked.prepare
+    answers = [promised(other, again.prepare) for other in others]
+    assert not any(step.is_dirty for step, _ in answers)
+    assert last(did(proposer.on_answer, answer, BALLOT_S) for _, answer in answers).accept is not None
+
+
+def test_what_a_proposer_s_own_loop_stands_still_is_not_taken_from_its_change() -> None:
+    proposer = make("r1")
+    did(proposer.propose, FIRST, 0.0)
+    assert did(proposer.tick, 20 * BALLOT_S).prepare is not None
+    end = 20 * BALLOT_S
+    while did(proposer.tick, proposer.next_deadline()).finished is None:
+        end = proposer.next_deadline()
+    assert end > 24 * BALLOT_S
 
 
 def test_move_raises_epoch_and_revision_retune_only_the_revision() -> None:
@@ -265,13 +289,12 @@ def test_refused_by_a_majority_tries_above_the_promised_counter() -> None:
 
 
 def test_duplicated_prepare_does_not_count_as_refusal() -> None:
-    proposer, others = make("r1"), [make("r2"), make("r3")]
+    proposer = make("r1")
     asked = did(proposer.propose, FIRST, 0.0)
     assert asked.prepare is not None
-    for other in others:
-        promised(other, asked.prepare)
-        _, echo = promised(other, asked.prepare)
-        assert isinstance(echo, Refused)
+    mine = asked.prepare.ballot
+    for other in ("r2", "r3"):  # as an older program echoes what it has promised already
+        echo = Refused(elector=other, task="merge", ballot=mine, refusal=Refusal.BALLOT, promised=mine)
         did(proposer.on_answer, echo, 0.0)
     assert proposer.next_deadline() == BALLOT_S  # still the same attempt
 
@@ -279,14 +302,22 @@ def test_duplicated_prepare_does_not_count_as_refusal() -> None:
 # --- unknown outcomes ------------------------------------------------------------------------------------------------
 
 
+def overtake(proposer: TaskRegister, acceptors: Iterable[TaskRegister], asked: Prepare | Accept) -> None:
+    """A rival's ballot is promised, and the proposer hears so when it asks again."""
+    for acceptor in acceptors:
+        promised(acceptor, prepare(9))
+        answer = promised(acceptor, asked) if isinstance(asked, Prepare) else accepted(acceptor, asked, 0.0)
+        assert did(proposer.on_answer, answer[1], BALLOT_S) == Step()
+
+
 def sent_and_unanswered(acceptors: list[TaskRegister]) -> TaskRegister:
-    """r1 has sent its accept to ``acceptors`` and heard nothing; it waits for its next attempt."""
+    """r1 heard nothing of its accept at ``acceptors``, and a rival has overtaken it; it waits for its next attempt."""
     proposer = make("r1")
     asked = promise_all(proposer, did(proposer.propose, FIRST, 0.0), acceptors)
     assert asked.accept is not None
     for acceptor in acceptors:
         accepted(acceptor, asked.accept, 0.0)
-    assert did(proposer.tick, BALLOT_S) == Step()
+    overtake(proposer, acceptors, asked.accept)
     return proposer
 
 
@@ -306,15 +337,25 @@ def test_unknown_outcome_that_nobody_can_tell_ends_as_unknown() -> None:
     assert end == (FIRST, RoundOutcome.UNKNOWN)
 
 
-def test_lost_accept_is_not_sent_again() -> None:
+def test_a_lost_accept_is_sent_again_under_its_ballot() -> None:
+    others = [make("r2"), make("r3")]
+    proposer = make("r1")
+    asked = promise_all(proposer, did(proposer.propose, FIRST, 0.0), others)
+    again = did(proposer.tick, BALLOT_S)
+    assert again.accept == asked.accept
+    assert accept_all(proposer, again, others).finished == (FIRST, RoundOutcome.COMMITTED)
+
+
+def test_an_accept_that_is_overtaken_is_not_sent_again() -> None:
     """Nobody has our value: the identity round carries what it reads, and the change does not stand."""
     others = [make("r2"), make("r3")]
     for other in others:
         accepted(other, accept(1, allocation(1), "r0"), 0.0)
     proposer = make("r1", state=replace(BLANK, learnt=allocation(1)))
     change = replace(FIRST, base_revision=1, owner="e5")
-    promise_all(proposer, did(proposer.propose, change, 0.0), others)
-    did(proposer.tick, BALLOT_S)  # the accept is lost
+    lost = promise_all(proposer, did(proposer.propose, change, 0.0), others).accept
+    assert lost is not None
+    overtake(proposer, others, lost)
     asked = promise_all(proposer, did(proposer.tick, proposer.next_deadline()), others)
     assert asked.accept is not None
     assert asked.accept.acceptance.value == allocation(1)

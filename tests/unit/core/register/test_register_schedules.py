@@ -104,6 +104,8 @@ class World:
         risk = self.promise_risk if answer is not None and isinstance(answer[1], Promise) else self.crash_rate
         if self.faulty() and self.rng.random() < risk:
             return self.crash(host)
+        if step.learnt is not None:
+            self.check_learnt(step.learnt)
         for end in step.ends:
             self.on_end(host, *end)
         if step.learnt is not None:
@@ -136,9 +138,9 @@ class World:
 
     def on_end(self, host: Host, change: Change, outcome: RoundOutcome) -> None:
         self.ended.append((change, outcome))
-        learnt = host.disk.learnt
         if outcome is not RoundOutcome.COMMITTED:
             return
+        learnt = None if host.register is None else host.register.state.learnt
         if learnt is None or learnt.revision < change.base_revision + 1:
             raise ViolationError(f"{change} committed, but not learnt")
         if not is_made_by(self.chosen[change.base_revision + 1], change):
@@ -277,7 +279,7 @@ def test_register_random_schedules_keep_one_value_per_revision_and_commit_once_f
         world = play(seed)
         outcomes |= {outcome for _, outcome in world.ended}
         newest = max(newest, *world.chosen)
-        last = [host.disk.learnt for host in world.hosts.values()]
+        last = [host.register and host.register.state.learnt for host in world.hosts.values()]
         assert last.count(last[0]) == len(last), f"seed {seed}: nodes ended with different values"
     assert outcomes >= {RoundOutcome.COMMITTED, RoundOutcome.CONFLICT}
     assert newest >= 4  # the schedules do get somewhere
