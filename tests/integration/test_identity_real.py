@@ -133,9 +133,13 @@ def test_an_elector_of_another_generation_is_not_counted_and_comes_back_by_what_
     bed.wait(lambda: bed.status("robot1")["quorum"]["apart"] == ["robot3"], 60, "robot1 to leave robot3 out")
     assert bed.status("robot1")["quorum"]["alive"] == 2
     assert not bed.wait(lambda: bed.status("robot3"), 60, "robot3")["quorum"]["ok"], "it is alone"
-    (said,) = [one for one in bed.status("robot1")["problems"] if one.startswith("generation/robot3")]
-    advice = re.search(r"stop this daemon, `zsched init (.+)` here, start it", said)
-    assert advice is not None, said
+
+    def told() -> re.Match[str] | None:
+        said = "\n".join(bed.status("robot1")["problems"])
+        return re.search(r"stop this daemon, `zsched init (.+)` here, start it", said)
+
+    advice = bed.wait(told, 90, "the advice, once it has been so for a minute")
+    assert advice is not None
     for node in ("robot1", "robot2", "edge1"):
         bed.stop(node)
         done = partial(run_init, bed, node, bed.folder / node, *advice[1].split())

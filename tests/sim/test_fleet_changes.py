@@ -85,7 +85,7 @@ def test_a_task_that_is_added_again_is_another_one_for_who_was_away(orphan_s: fl
         assert play.sim.run_until(lambda: play.sim.node("robot2").fleet.tasks == tasks, 20)  # noqa: B023 - at once
     play.sim.start("robot3")
     back = play.sim.node("robot3")
-    epoch, newest = back.executors["other"].epoch, play.sim.node("robot1").agreement.fleet_revision
+    epoch, newest = back.registers["other"].value.epoch, play.sim.node("robot1").agreement.fleet_revision
     assert epoch // CREATION_STEP == 1
     assert play.sim.run_until(lambda: play.sim.node("robot3").agreement.fleet_revision == newest, 5)
     assert play.sim.node("robot3").executors["other"].epoch // CREATION_STEP in (0, 2)

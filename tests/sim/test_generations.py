@@ -100,6 +100,8 @@ def test_electors_that_have_all_lost_their_state_say_what_the_operator_does() ->
     sim.run(1)
     lose_state(sim, *ROBOTS)
     sim.run(2)
+    assert "--force" not in problems(sim, "edge1"), "they may come back"
+    sim.run(65)
     for name in ("edge1", "robot1"):
         assert "`zsched init --generation 2 --force` on every node" in problems(sim, name), problems(sim, name)
 

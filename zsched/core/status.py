@@ -61,8 +61,8 @@ STARTED_BEFORE = (
     "there: the session {owner}-{task}.zenoh.json5 has this robot's address since"
 )
 INIT_THERE = "stop zsched there, run `zsched init` (it asks the fleet, and refuses where that is unsafe), and start it"
-RECOVER_AFTER_S = 60.0
-"""A recovery is named only once there was no quorum for so long: daemons that begin anew, and machines that boot, come.
+DRASTIC_AFTER_S = 60.0
+"""What gives up a fleet's state is named only once its cause has stood for so long: daemons that begin anew come back.
 
 A recovery beside electors that come back makes two fleets of one.
 """
@@ -194,7 +194,8 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
             f"not {told}.{replaced or ' No owner is replaced'}"
         )
     if not has_enough and not node.has_others_state:
-        problems.append(_nothing_agreed(node, quorum, fresh))
+        problems.append(_nothing_agreed(node, quorum, fresh, now))
+    problems += _behind(node, now)
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return tuple(problems)
@@ -223,9 +224,27 @@ def _no_quorum(node: Stages, quorum: QuorumStatus, now: float, *, is_left_behind
         return told
     if silent:
         told += f"; waiting for {', '.join(silent)}"
-    if not node.agreement.document_hash or now < node.quorum_at + RECOVER_AFTER_S:
+    if not node.agreement.document_hash:
         return told
-    return f"{told}. Only for nodes that will never come back: {RECOVER}"
+    return told + _drastic(node, f". Only for nodes that will never come back: {RECOVER}", node.quorum_at, now)
+
+
+def _drastic(node: Stages, advice: str, since: float, now: float) -> str:
+    """Advice that gives up what a fleet remembers: none while its cause is young, or a disk only has to be freed."""
+    has_stood = now >= since + DRASTIC_AFTER_S
+    return advice if has_stood and not node.disks.refusal and not node.disks.refusals() else ""
+
+
+def _behind(node: Stages, now: float) -> Iterator[str]:
+    """What brings nodes of several generations together again."""
+    for name, (generation, since, _) in sorted(node.agreement.behind.items()):
+        ours = node.agreement.generation or 0
+        command = f"`zsched init --generation {max(generation, ours)}`"
+        where = f"on {name}, with its daemon stopped: {command}"
+        if generation > ours:
+            where = f"stop this daemon, {command} here, start it; so on every node that is behind {name}"
+        if told := _drastic(node, where, since, now):
+            yield told
 
 
 def has_quorum(node: Stages) -> bool:
@@ -245,15 +264,20 @@ def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:
     return [name for name in quorum.stateless if name in fileless and name not in node.agreement.voted]
 
 
-def _nothing_agreed(node: Stages, quorum: QuorumStatus, fresh: list[NodeId]) -> str:
-    """The way out of too many missing states: `init` where it was forgotten, else a new generation."""
+def _nothing_agreed(node: Stages, quorum: QuorumStatus, fresh: list[NodeId], now: float) -> str:
+    """The way out of too many missing states: `init` where it was forgotten, else a new generation.
+
+    The electors without a state say so themselves; the others must be there, too, before these are given up.
+    """
     what = "nothing can be agreed: too many electors without their states"
-    if node.agreement.document_hash:
-        return f"{what} (each says why); if these are lost, {RECOVER}"
-    number = node.agreement.newest_generation + 1
-    if quorum.electors - len(quorum.stateless) + len(fresh) < quorum.needed:
-        return f"{what} (each says why); if these are lost, {way_out(number)}"
-    return f"{what}. No state file on {', '.join(fresh)}: {INIT_THERE}. Only where it refuses, {way_out(number)}"
+    heard = [name for name in node.fleet.electors if node.membership.state(name) is PeerState.ALIVE]
+    lost = RECOVER if node.agreement.document_hash else way_out(node.agreement.newest_generation + 1)
+    is_forgotten = quorum.electors - len(quorum.stateless) + len(fresh) >= quorum.needed
+    if is_forgotten and not node.agreement.document_hash:
+        what, lost = f"{what}. No state file on {', '.join(fresh)}: {INIT_THERE}", f". Only where it refuses, {lost}"
+    else:
+        what, lost = f"{what} (each says why)", f"; if these are lost, {lost}"
+    return what + (_drastic(node, lost, node.quorum_at, now) if len(heard) >= quorum.needed else "")
 
 
 def _why_silent(node: Stages, name: NodeId, now: float) -> str:

@@ -154,7 +154,7 @@ class Register(ABC, Generic[V]):
         self.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)
 
     def adopt_clocks(self, *, ballot_s: float, stagger_s: float) -> None:
-        """Go by other clocks from the next phase on (arguments as of `adopt`): what is under way has more time, or less.
+        """Go by other clocks (arguments as of `adopt`), with the next phase: what is under way has more time, or less.
 
         What was asked by the old ones is asked again when it was due: answers to it may have come too late.
         """

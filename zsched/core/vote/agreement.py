@@ -111,8 +111,8 @@ class Agreement:
         self.voted = set() if durable is None else set(durable.voted)
         is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
         self._problems: dict[str, str] = {}
-        self._behind_at: dict[NodeId, float] = {}
-        """{node of another generation: when it last said so}; each has its line in the problems."""
+        self.behind: dict[NodeId, tuple[int, float, float]] = {}
+        """{node of another generation: (that one, since when it says so, when it last did)}; each has its problem."""
         if durable is not None and self._lost:
             value = None if durable.fleet_register is None else durable.fleet_register.learnt
             self._complain_of_loss(is_agreed=value is not None and bool(value.document))
@@ -220,7 +220,7 @@ class Agreement:
         self._numbers.adopt(fleet)
         self.strangers.silence_s = fleet.timing.suspect_s
         self.helm.adopt(stagger_s=HELM_BALLOTS * fleet.timing.ballot_s)
-        for node in [node for node in self._behind_at if node not in self._nodes]:
+        for node in [node for node in self.behind if node not in self._nodes]:
             self._show_no_more(node)
         kept = dict(self.registers)
         self.registers.clear()  # the roll goes by the same table
@@ -720,24 +720,22 @@ class Agreement:
         if is_ours:
             self._show_no_more(node)
             return True
-        ours = self.generation or 0
-        command = f"`zsched init --generation {max(generation, ours)}`"
-        where = f"there, with that daemon stopped: {command}"
-        if generation > ours:
-            where = f"stop this daemon, {command} here, start it; so on every node that is behind"
-        self._behind_at[node] = now
-        self._problems[f"generation/{node}"] = f"{node} is of generation {generation}, this node of {ours}; {where}"
+        told, since, _ = self.behind.get(node, (generation, now, now))
+        self.behind[node] = generation, since if told == generation else now, now
+        self._problems[f"generation/{node}"] = (
+            f"{node} is of generation {generation}, this node of {self.generation or 0}"
+        )
         return False
 
     def _show_no_more(self, node: NodeId) -> None:
         """A node is not of another generation, or nothing is heard or known of it any more."""
-        if self._behind_at.pop(node, None) is not None:
+        if self.behind.pop(node, None) is not None:
             self._problems.pop(f"generation/{node}", None)
 
     def forget(self, now: float) -> None:
         """Nodes of other generations that are not heard any more are not shown."""
         self.strangers.forget(now)
-        for node in [node for node, at in self._behind_at.items() if now - at >= SHOWN_S]:
+        for node in [node for node, (_, _, at) in self.behind.items() if now - at >= SHOWN_S]:
             self._show_no_more(node)
 
     def _is_guest_of(self, generation: int) -> bool:
@@ -777,7 +775,7 @@ class Agreement:
 
     def _complain_of_loss(self, *, is_agreed: bool) -> None:
         """Say that this node is no elector, and until when: by an agreed document another disk is another member."""
-        lost = lost_text(self._lost, self.newest_generation, is_agreed=is_agreed)
+        lost = lost_text(self._lost, is_agreed=is_agreed)
         joins = "" if self._durable is None else self._durable.joins
         self._problems["state"] = lost if not joins else moved_text(self._lost, joins)
 

@@ -173,12 +173,12 @@ def moved_text(why: str, joins: str) -> str:
     )
 
 
-def lost_text(why: str, newest_generation: int, *, is_agreed: bool) -> str:
+def lost_text(why: str, *, is_agreed: bool) -> str:
     """Why a node whose state is lost is no elector, and until when.
 
     ``is_agreed``: the fleet goes by an agreed document, in which another disk is another member.
     """
-    until = f"a new generation ({way_out(newest_generation + 1)})"
+    until = "a new generation (`zsched init --help`); it works all the same, and the fleet agrees without it if it can"
     if is_agreed:
         until = "it is added as one anew, which `electorate: auto` does by itself once its old seat is given up"
     return (
