@@ -299,9 +299,7 @@ def ends_with_one(rollout: Rollout) -> bool:
 
 @pytest.mark.parametrize("fleet", [OLD, NEW], ids=["old file", "new file"])
 @pytest.mark.parametrize("seed", range(2))
-def test_a_candidate_whose_folder_is_brought_back_never_works_beside_a_lease(
-    seed: int, fleet: Fleet
-) -> None:
+def test_a_candidate_whose_folder_is_brought_back_never_works_beside_a_lease(seed: int, fleet: Fleet) -> None:
     """Nothing on that machine can know what was agreed since: it is told no role before a majority is heard."""
     rollout = Rollout(seed)
     twice_s = forgetful(rollout, fleet, rollout.sim.disk(rollout.owner() or ""))
