@@ -399,7 +399,7 @@ class Stages:
         load = None if told is None else told.worker(task)
         is_at_work = load is not None and (load.unended_s is not None or (load.jobs is not None and load.jobs.backlog))
         is_told = unready is not None and now - unready.since >= UNREADY_SHOWN_S
-        return None if is_told or is_at_work else self.hangs.rhythms.overdue_s(task, value.epoch, now)
+        return None if is_told or is_at_work else self.hangs.progress.overdue_s(task, value.epoch, now)
 
     def tend_disks(self) -> None:
         """Somebody has told how long a save takes: the clocks of votes leave room for it."""

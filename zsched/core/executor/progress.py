@@ -3,8 +3,8 @@
 Knows: the counters of every robot's relay, when a worker was last given time. Does not know: processes, streams, zenoh.
 
 Inputs and outputs pass through the robots' relays, never through the owner's. They look the same for a worker with our
-library and for any other zenoh program. So each robot reports in its profile whether a task answers it (`Progress`),
-and the owner's daemon combines these reports (`HangJudge`).
+library and for any other zenoh program. So each robot reports in its profile whether a task answers it
+(`zsched.core.executor.rhythm`), and the owner's daemon combines these reports (`HangJudge`).
 
 A robot that sees the worker come back (it was restarted in place) forgets how long it has waited for the life before:
 on a busy machine that complaint would reach the owner behind the new life's first answers, and end that, too.
@@ -21,116 +21,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 
-from zsched.core.executor.handover import Executor, Phase
-from zsched.core.executor.rhythm import Rhythms
+from zsched.core.executor.handover import Executor
+from zsched.core.executor.rhythm import COUNT_S, Progress
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import RecordStory, RestartWorker
 from zsched.core.scheduler.probation import LIMIT_S
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.plan import Direction, StreamCount
+from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import Profile, TaskProgress, WorkerState
-from zsched.core.values.struct import Struct
 
-COUNT_S = 1.0
-"""Period of the relays' counters, so a report is at most this old."""
 MARGIN_S = 1.5
 """A complaint may be this much older than the answer that ends it: `COUNT_S` and a profile's way."""
-_INPUTS, _OUTPUTS = "in", "out"
-"""The directions in stream names (`zsched.core.route.route`)."""
-
-
-class _Seen(Struct):
-    """What one robot has seen of one task."""
-
-    epoch: int
-    taken: int
-    given: int
-    taken_at: float | None = None
-    """When an input last went to the owner; ``None``: not in this epoch."""
-    given_at: float | None = None
-    waits_since: float | None = None
-    """When the first input behind the newest output was seen; ``None`` while nothing waits."""
-
-
-class Progress:
-    """A robot's view: does the owner's worker return anything for its inputs?"""
-
-    def __init__(self, specs: Iterable[TaskSpec]) -> None:
-        self._seen: dict[TaskId, _Seen] = {}
-        self.adopt(tuple(specs))
-
-    def adopt(self, specs: tuple[TaskSpec, ...]) -> None:
-        """Watch these tasks from now on; what was seen of the others is forgotten."""
-        self._deadlines = {spec.name: spec.worker.output_deadline_s for spec in specs}
-        self._has_outputs = {
-            spec.name: any(rule.direction is Direction.OUTPUT for rule in spec.rules) for spec in specs
-        }
-        self._seen = {task: seen for task, seen in self._seen.items() if task in self._deadlines}
-
-    def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
-        """Take the relay's counters in."""
-        for task, deadline_s in self._deadlines.items():
-            executor = executors[task]
-            if deadline_s is None or not executor.has_streams:
-                continue
-            if executor.phase is not Phase.SETTLED or executor.is_local:
-                self._seen.pop(task, None)  # during a handover nobody owes anything
-                continue
-            self._note(task, executor.epoch, counts, now)
-
-    def _note(self, task: TaskId, epoch: int, counts: tuple[StreamCount, ...], now: float) -> None:
-        taken, given = self._sums(task, counts)
-        seen = self._seen.get(task)
-        is_new = seen is None or seen.epoch != epoch or taken < seen.taken or given < seen.given
-        if seen is None or is_new:
-            self._seen[task] = _Seen(epoch=epoch, taken=taken, given=given)
-            return
-        if given > seen.given:
-            seen.given_at, seen.waits_since = now, None
-        if taken > seen.taken:
-            seen.taken_at = now
-            if given == seen.given and seen.waits_since is None:
-                seen.waits_since = now
-        seen.taken, seen.given = taken, given
-
-    def _sums(self, task: TaskId, counts: tuple[StreamCount, ...]) -> tuple[int, int]:
-        """(inputs, outputs) so far; a task without outputs counts its worker's acknowledgements, if there are any."""
-        inputs = [count for count in counts if count.stream.startswith(f"{task}/{_INPUTS}/")]
-        outputs = [count for count in counts if count.stream.startswith(f"{task}/{_OUTPUTS}/")]
-        taken = sum(count.messages for count in inputs)
-        if self._has_outputs[task]:
-            return taken, sum(count.messages for count in outputs)
-        if any(count.acknowledged is None for count in inputs):
-            return 0, 0  # nobody can tell
-        return taken, sum(count.acknowledged or 0 for count in inputs)
-
-    def begin_again(self, task: TaskId, now: float) -> None:
-        """Start the wait of every open input again, now."""
-        seen = self._seen.get(task)
-        if seen is not None and seen.waits_since is not None:
-            seen.waits_since = now
-
-    def on_new_life(self, task: TaskId) -> None:
-        """The owner's worker is back: what the one before owed is not this one's."""
-        seen = self._seen.get(task)
-        if seen is not None:
-            seen.waits_since = None  # the next counters tell whether it owes something
-
-    def reports(self, now: float) -> tuple[TaskProgress, ...]:
-        """This robot's reports: served, or waiting for longer than the deadline while inputs flow."""
-        found = []
-        for task, seen in sorted(self._seen.items()):
-            limit_s = max(self._deadlines[task] or 0.0, 2 * COUNT_S)
-            if seen.waits_since is None:
-                if seen.given_at is not None and now - seen.given_at <= limit_s:
-                    found.append(TaskProgress(task=task, epoch=seen.epoch, is_served=True))
-                continue
-            is_flowing = seen.taken_at is not None and now - seen.taken_at <= limit_s
-            if is_flowing and now - seen.waits_since >= (self._deadlines[task] or 0.0):
-                found.append(TaskProgress(task=task, epoch=seen.epoch, is_served=False))
-        return tuple(found)
 
 
 class HangJudge:
@@ -188,11 +91,10 @@ class HangJudge:
 
 
 class HangWatch:
-    """Both views of one node, over all tasks that say `output_deadline_s`, and the rhythm of all others."""
+    """Both views of one node: as an owner of the tasks that say `output_deadline_s`, as a robot of all."""
 
     def __init__(self, fleet: Fleet) -> None:
-        self._progress = Progress(())
-        self.rhythms = Rhythms()
+        self.progress = Progress()
         self._judge = HangJudge()
         self._back_at: dict[NodeId, float] = {}
         """{robot: when it was heard again after a silence}."""
@@ -208,10 +110,10 @@ class HangWatch:
             now: monotonic seconds.
         """
         known = self._specs
+        self._tasks = fleet.tasks
         self._specs = {spec.name: spec for spec in fleet.tasks if spec.worker.output_deadline_s is not None}
         self._voters = fleet.voters
-        self._progress.adopt(tuple(self._specs.values()))
-        self.rhythms.adopt(fleet.tasks)
+        self.progress.adopt(fleet.tasks)
         for task in [task for task in known if task not in self._specs]:
             self._judge.note_worker(task, WorkerState.STOPPED, now)
         for task in [task for task in self._specs if task not in known and task in workers]:
@@ -220,9 +122,7 @@ class HangWatch:
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Our relay has counted."""
-        self.rhythms.absorb(counts, executors, now)
-        if self._specs:
-            self._progress.absorb(counts, executors, now)
+        self.progress.absorb(counts, executors, now)
 
     def note_worker(self, task: TaskId, state: WorkerState, now: float) -> None:
         """A worker of this node has changed."""
@@ -230,17 +130,21 @@ class HangWatch:
             self._judge.note_worker(task, state, now)
 
     def on_ready_again(self, task: TaskId) -> None:
-        """Our relay lacked the owner's worker, and has it again."""
-        self._progress.on_new_life(task)
+        """Our relay lacked the owner's worker, and has it again: maybe another one, which is not to be ended for it."""
+        if task in self._specs:
+            self.progress.begin_again(task)
+
+    def excuse(self, task: TaskId) -> None:
+        """The owner's worker is away or another one, or the way to it was: by its rhythm it owes nothing so far."""
+        if task not in self._specs:
+            self.progress.begin_again(task)
 
     def note_lag(self, lag_s: float, now: float) -> None:
         """This node stood still for this many seconds; a pause of half a deadline or more starts all waits again."""
-        if lag_s >= COUNT_S / 2:
-            self.rhythms.begin_again()
-        for task, spec in self._specs.items():
+        for spec in self._tasks:
             if lag_s >= max(spec.worker.output_deadline_s or 0.0, COUNT_S) / 2:
-                self._progress.begin_again(task, now)
-                self._judge.begin_again(task, now)
+                self.progress.begin_again(spec.name, now)
+                self._judge.begin_again(spec.name, now)
 
     def on_back(self, node: NodeId, now: float) -> None:
         """A peer that was suspect or gone is heard again."""
@@ -253,7 +157,7 @@ class HangWatch:
 
     def reports(self, now: float) -> tuple[TaskProgress, ...]:
         """The reports for our profile."""
-        return self._progress.reports(now)
+        return self.progress.reports(now)
 
     def look(
         self,

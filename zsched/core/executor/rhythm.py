@@ -6,6 +6,9 @@ A worker may hang, and a way may carry beats and let nothing large through: eith
 library acknowledges each input, so there the oldest one under way tells; of any other program the outputs do. A task
 that has not answered yet, or has no outputs, is never judged. To a robot an owner that has ceased to answer is one that
 its streams do not reach (docs/decisions/0114).
+
+Where the file says how soon a task answers (`output_deadline_s`) that counts in place of its rhythm, and is reported to
+the owner (`zsched.core.executor.progress`).
 """
 
 from __future__ import annotations
@@ -18,8 +21,11 @@ from zsched.core.executor.handover import Executor, Phase
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import Direction, StreamCount
+from zsched.core.values.profile import TaskProgress
 from zsched.core.values.struct import Struct
 
+COUNT_S: Final = 1.0
+"""Period of the relays' counters, so a report is at most this old."""
 LEAST_S: Final = 3.0
 """However quickly a task answers, it may be silent for so long..."""
 HUNG_TIMES: Final = 16.0
@@ -37,6 +43,8 @@ class Rhythm(Struct):
     flowed_s: float = 0.0
     """For how long inputs or answers flowed while so many answers came."""
     taken_at: float = 0.0
+    given_at: float | None = None
+    """When an answer of this owner was counted last."""
     waits_since: float | None = None
     """When an input that has no answer yet was seen; ``None``: none waits."""
     mark: int = 0
@@ -51,7 +59,7 @@ class Rhythm(Struct):
         before, at = (self.taken, self.given), self.at
         self.taken, self.given, self.at = taken, given, now
         if at is None or taken < before[0] or given < before[1]:
-            self.waits_since = None
+            self.waits_since = self.given_at = None
             return
         self.taken_at = now if taken > before[0] else self.taken_at
         if in_flight is not None:
@@ -63,51 +71,46 @@ class Rhythm(Struct):
         elif taken > before[0] and self.waits_since is None:
             self.waits_since = now
         if given > before[1]:
-            self.answers += given - before[1]
+            self.answers, self.given_at = self.answers + given - before[1], now
             self.fled_s = max(self.fled_s - FORGIVEN_RATIO * (now - at), 0.0)
         if (taken, given) != before and self.overdue_s(now) is None:
             self.flowed_s += now - at
 
-    def begin_again(self) -> None:
-        """What is open waits from now on."""
-        self.waits_since = None
-
     def leave(self, now: float) -> None:
         """The task has another owner, or is about to."""
         self.fled_s = self.overdue_s(now) or self.fled_s
-        self.waits_since = self.at = None
+        self.waits_since = self.given_at = self.at = None
+
+    def waited_s(self, now: float, limit_s: float) -> float | None:
+        """For how long an input has waited while others came, if that is the limit at least."""
+        if self.waits_since is None or now - self.waits_since < limit_s:
+            return None
+        return now - self.waits_since if now - self.taken_at <= max(limit_s, 2.0 * COUNT_S) else None
 
     def overdue_s(self, now: float) -> float | None:
         """For how long no answer has come that should have, while inputs flow; ``None``: not too long."""
-        if self.waits_since is None or not self.answers:
+        if self.waits_since is None or not self.answers or self.taken_at == self.waits_since:
             return None
-        waited_s = now - self.waits_since
-        gap_s = (self.flowed_s - waited_s) / self.answers
-        limit_s = max(LEAST_S, HUNG_TIMES * gap_s, 2.0 * self.longest_s, 2.0 * self.fled_s)
-        is_flowing = self.waits_since < self.taken_at > now - limit_s
-        return waited_s if waited_s >= limit_s and is_flowing else None
+        gap_s = (self.flowed_s - (now - self.waits_since)) / self.answers
+        return self.waited_s(now, max(LEAST_S, HUNG_TIMES * gap_s, 2.0 * self.longest_s, 2.0 * self.fled_s))
 
 
-class Rhythms:
-    """This robot's, of all tasks but those that say themselves how soon they answer (`output_deadline_s`)."""
+class Progress:
+    """One robot's view of all tasks: does the owner answer?"""
 
-    def __init__(self) -> None:
+    def __init__(self, specs: Iterable[TaskSpec] = ()) -> None:
         self._known: dict[TaskId, tuple[int, dict[str, Rhythm]]] = {}
         """{task: (epoch, {stream, or empty: its rhythm})}."""
-        self._has_outputs: dict[TaskId, bool] = {}
+        self.adopt(specs)
 
     def adopt(self, specs: Iterable[TaskSpec]) -> None:
         """Watch these tasks from now on."""
-        self._has_outputs = {
-            spec.name: any(rule.direction is Direction.OUTPUT for rule in spec.rules)
-            for spec in specs
-            if spec.worker.output_deadline_s is None
-        }
-        self._known = {task: known for task, known in self._known.items() if task in self._has_outputs}
+        self._specs = {spec.name: spec for spec in specs}
+        self._known = {task: known for task, known in self._known.items() if task in self._specs}
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
-        """Take the relay's counters in."""
-        for task in self._has_outputs:
+        """Take the relay's counters in; during a handover nobody owes anything."""
+        for task, spec in self._specs.items():
             executor = executors[task]
             epoch, known = self._known.get(task, (executor.epoch, dict[str, Rhythm]()))
             is_steady = executor.has_streams and executor.phase is Phase.SETTLED and not executor.is_local
@@ -115,27 +118,49 @@ class Rhythms:
                 for rhythm in known.values():
                     rhythm.leave(now)
             self._known[task] = (executor.epoch, known)
-            for name, taken, given, in_flight in self._streams(task, counts) if is_steady else ():
+            for name, taken, given, in_flight in _streams(spec, counts) if is_steady else ():
                 known.setdefault(name, Rhythm()).count(taken, given, in_flight, now)
 
-    def _streams(self, task: TaskId, counts: tuple[StreamCount, ...]) -> Iterator[tuple[str, int, int, int | None]]:
-        """(name, inputs, answers, inputs under way) of what tells something."""
-        inputs = [count for count in counts if count.stream.startswith(f"{task}/in/")]
-        acknowledged = [(count, count.acknowledged) for count in inputs if count.acknowledged is not None]
-        for count, given in acknowledged:
-            yield count.stream, count.messages, given, count.in_flight or 0
-        if not acknowledged and self._has_outputs[task]:
-            outputs = sum(count.messages for count in counts if count.stream.startswith(f"{task}/out/"))
-            yield "", sum(count.messages for count in inputs), outputs, None
-
-    def begin_again(self, task: TaskId | None = None) -> None:
-        """All that is open waits from now on: the worker is another one, or (of all tasks) this machine stood still."""
-        for name in self._known if task is None else (task,):
-            for rhythm in self._known.get(name, (0, {}))[1].values():
-                rhythm.begin_again()
+    def begin_again(self, task: TaskId, now: float | None = None) -> None:
+        """What is open waits from ``now`` on; ``None``: another life of the worker owes nothing so far."""
+        for rhythm in self._known.get(task, (0, {}))[1].values():
+            rhythm.waits_since = None if rhythm.waits_since is None else now
 
     def overdue_s(self, task: TaskId, epoch: int, now: float) -> float | None:
-        """For how long the owner of an epoch has answered nothing here that it should have; ``None``: not too long."""
-        counted, known = self._known.get(task, (epoch, {}))
-        waits_s = (one.overdue_s(now) for one in known.values() if counted == epoch)
-        return max((waited_s for waited_s in waits_s if waited_s is not None), default=None)
+        """For how long the owner of an epoch has answered nothing here that it should have; ``None``: not too long.
+
+        Not of a task that says how soon it answers.
+        """
+        spec, (counted, known) = self._specs.get(task), self._known.get(task, (epoch, {}))
+        if spec is None or counted != epoch or spec.worker.output_deadline_s is not None:
+            return None
+        return max((waited_s for one in known.values() if (waited_s := one.overdue_s(now)) is not None), default=None)
+
+    def reports(self, now: float) -> tuple[TaskProgress, ...]:
+        """This robot's reports of the tasks that say how soon they answer: served, or waiting while inputs flow."""
+        found = []
+        for task, (epoch, known) in sorted(self._known.items()):
+            deadline_s, rhythm = self._specs[task].worker.output_deadline_s, known.get("")
+            if deadline_s is None or rhythm is None:
+                continue
+            is_answered = rhythm.waits_since is None and rhythm.given_at is not None
+            is_served = is_answered and now - (rhythm.given_at or 0.0) <= max(deadline_s, 2.0 * COUNT_S)
+            if is_served or rhythm.waited_s(now, deadline_s) is not None:
+                found.append(TaskProgress(task=task, epoch=epoch, is_served=is_served))
+        return tuple(found)
+
+
+def _streams(spec: TaskSpec, counts: tuple[StreamCount, ...]) -> Iterator[tuple[str, int, int, int | None]]:
+    """(name, inputs, answers, inputs under way) of what tells something."""
+    inputs = [count for count in counts if count.stream.startswith(f"{spec.name}/in/")]
+    acknowledged = [(count, count.acknowledged) for count in inputs if count.acknowledged is not None]
+    has_outputs = any(rule.direction is Direction.OUTPUT for rule in spec.rules)
+    if spec.worker.output_deadline_s is None and acknowledged:
+        for count, given in acknowledged:
+            yield count.stream, count.messages, given, count.in_flight or 0
+        return
+    taken, outputs = sum(count.messages for count in inputs), (f"{spec.name}/out/",)
+    if has_outputs:
+        yield "", taken, sum(count.messages for count in counts if count.stream.startswith(outputs)), None
+    elif len(acknowledged) == len(inputs):
+        yield "", taken, sum(given for _, given in acknowledged), None

@@ -263,7 +263,7 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
         if change.before in (PeerState.SUSPECT, PeerState.GONE):
             node.hangs.on_back(change.node, now)
             for task in [name for name, value in node.values().items() if value.owner == change.node]:
-                node.hangs.rhythms.begin_again(task)
+                node.hangs.excuse(task)
     if change.after is PeerState.GONE:
         node.probation.on_gone(change.node, now)
         node.sealing.on_gone(change.node)

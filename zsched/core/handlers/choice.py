@@ -83,7 +83,7 @@ def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float)
     for task in owned:
         load = profile.worker(task)
         if load is not None and load.state is not WorkerState.READY:
-            node.hangs.rhythms.begin_again(task)
+            node.hangs.excuse(task)
     is_to_leave = bool(owned) and (profile.draining or bool(owned & failed) or bool(owned & given_away(profile)))
     # With an orphan about, this may be the candidate that the task waits for.
     todo.must_decide |= is_to_leave or any(node.is_orphan(value.owner) for value in values.values())

@@ -174,7 +174,7 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     if state is PeerState.GONE or (state is PeerState.SUSPECT and is_escape):
         return True
     profile = node.gateway.fresh(left, now)
-    if is_escape and node.hangs.rhythms.overdue_s(value.task, node.executors[value.task].epoch, now) is not None:
+    if is_escape and node.hangs.progress.overdue_s(value.task, node.executors[value.task].epoch, now) is not None:
         return True
     if is_escape and node.unfit(value.task, now).get(left, "").startswith((TOO_FEW_ELECTORS, HAS_RESTED)):
         return True  # or it comes back with each of its links' good moments
@@ -205,7 +205,7 @@ def _on_worker(node: Stages, event: ev.WorkerChanged, todo: ToDo, now: float) ->
         node.agreement.leases.on_worker_lost(event.task)
     node.hangs.note_worker(event.task, event.state, now)
     if event.task in node.owned():
-        node.hangs.rhythms.begin_again(event.task)
+        node.hangs.excuse(event.task)
     todo.add(story)
     todo.must_decide |= event.task in node.owned()
 
@@ -248,7 +248,7 @@ def _on_slot_ready(node: Stages, event: ev.SlotReady, todo: ToDo, now: float) ->
     if known is not None and known.slot.epoch == event.epoch:
         node.hangs.on_ready_again(event.task)
         if now - known.since >= UNREADY_SHOWN_S:
-            node.hangs.rhythms.begin_again(event.task)
+            node.hangs.excuse(event.task)
     node.executors[event.task].on_ready(event.epoch, todo)
 
 

@@ -15,7 +15,8 @@ from support.states import state_of
 from support.todos import todo_of
 from zsched.core import events as ev
 from zsched.core.executor.handover import Executor, Phase
-from zsched.core.executor.progress import COUNT_S, MARGIN_S, HangWatch, Progress
+from zsched.core.executor.progress import MARGIN_S, HangWatch
+from zsched.core.executor.rhythm import COUNT_S, Progress
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import Instruction, RecordStory, RestartWorker
 from zsched.core.node import Node

@@ -10,8 +10,7 @@ import pytest
 
 from support.fleets import task_of, tuning_of
 from zsched.core.executor.handover import Executor, Phase
-from zsched.core.executor.progress import COUNT_S
-from zsched.core.executor.rhythm import HUNG_TIMES, LEAST_S, Rhythms
+from zsched.core.executor.rhythm import COUNT_S, HUNG_TIMES, LEAST_S, Progress
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.plan import Direction, ReadyWhen, StreamCount
 
@@ -29,8 +28,7 @@ class Robot:
     """One robot's counters, told once a second."""
 
     def __init__(self, spec: TaskSpec = FOREIGN, *, acknowledges: bool = False) -> None:
-        self.rhythms, self.acknowledges = Rhythms(), acknowledges
-        self.rhythms.adopt((spec,))
+        self.progress, self.acknowledges = Progress((spec,)), acknowledges
         self.executor = Executor(spec=spec, me="robot1", has_streams=True)
         self.executor.phase, self.executor.epoch, self.executor.owner = Phase.SETTLED, 1, "edge1"
         self.taken = self.given = 0.0
@@ -38,7 +36,7 @@ class Robot:
 
     @property
     def overdue_s(self) -> float | None:
-        return self.rhythms.overdue_s("merge", self.executor.epoch, self.now)
+        return self.progress.overdue_s("merge", self.executor.epoch, self.now)
 
     def run(self, seconds: float, *, in_hz: float = 10.0, out_hz: float = 0.0) -> bool:
         """Whether the owner was overdue at some moment of it."""
@@ -55,7 +53,7 @@ class Robot:
                 StreamCount(stream="merge/out/0", messages=0 if self.acknowledges else given),
                 StreamCount(stream="merger/out/0", messages=round(self.now)),  # another task's
             )
-            self.rhythms.absorb(counts, {"merge": self.executor}, self.now)
+            self.progress.absorb(counts, {"merge": self.executor}, self.now)
             was_overdue |= self.overdue_s is not None
         return was_overdue
 
@@ -148,7 +146,7 @@ def test_a_handover_and_another_life_of_the_worker_owe_nothing() -> None:
     robot.executor.phase = Phase.SETTLED
     assert not robot.run(LEAST_S + 1.0)
     assert robot.run(1.0)
-    robot.rhythms.begin_again("merge")
+    robot.progress.begin_again("merge")
     assert not robot.run(LEAST_S)
     robot.taken = robot.given = 0.0  # another relay
     assert not robot.run(LEAST_S + 1.0)
@@ -158,6 +156,6 @@ def test_what_is_no_task_any_more_is_forgotten() -> None:
     robot = Robot()
     robot.run(20.0, out_hz=10.0)
     assert robot.run(10.0)
-    robot.rhythms.adopt(())
+    robot.progress.adopt(())
     assert robot.overdue_s is None
     assert math.isfinite(robot.now)
