@@ -73,7 +73,7 @@ def _ask_on(config: str, count: int, interval_s: float, ask: Callable[[zenoh.Ses
 
 
 def _ask(session: zenoh.Session, selector: str, timeout_s: float, needs_answer: bool, size: int, found: Pinged) -> None:
-    began = monotonic_s()
+    began, before = monotonic_s(), {str(link.src) for link in session.info.links()}
     replies = session.get(
         selector,
         target=zenoh.QueryTarget.ALL,
@@ -85,7 +85,8 @@ def _ask(session: zenoh.Session, selector: str, timeout_s: float, needs_answer: 
     )
     answers = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
     took_s = monotonic_s() - began
-    if took_s >= timeout_s or (needs_answer and not answers):
+    is_cut = before.isdisjoint(str(link.src) for link in session.info.links())  # that ends the question, too
+    if took_s >= timeout_s or is_cut or (needs_answer and not answers):
         found.missed += 1
         return
     found.round_trips_s.append(took_s)
