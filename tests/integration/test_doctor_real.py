@@ -112,7 +112,8 @@ def test_ping_and_bugreport_of_a_real_fleet(bed: Testbed) -> None:
         return done.returncode, json.loads(done.stdout)
 
     code, body = ping("edge1")
-    assert (code, [way["answered"] for way in body["ways"]]) == (0, [2, 2, 2])
+    # control, data, data with 64 KiB and with 1 MiB, through the daemon
+    assert (code, [way["answered"] for way in body["ways"]]) == (0, [2, 2, 1, 1, 2])
     assert body["heard"] == {"robot1": {"edge1": "alive"}, "edge1": {"robot1": "alive"}}
     assert ping("edge2")[0] == 3
 
