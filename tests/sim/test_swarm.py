@@ -126,6 +126,7 @@ def test_a_fleet_whose_electors_lost_their_state_is_started_anew_and_gets_an_own
         sim.initialise(machine, generation=3)
     sim.start()
     assert sim.run_until(lambda: not sim.unsettled(), AT_MOST_S[sim.fleet.timing.name]), sim.unsettled()
+    sim.run(2.0)  # what is learnt is on the disks soon after it is acted upon
     assert min(revision for _, revision in sim.learnt if revision % GENERATION_STEP) == 3 * GENERATION_STEP + 1
 
 

@@ -20,7 +20,7 @@ from zsched.core.scheduler.utility import (
     service_utility,
     total_utility,
 )
-from zsched.core.values import fleet
+from zsched.core.values import endpoint
 from zsched.core.values.fleet import DEFAULT_BONUS
 from zsched.core.values.model import ScoreForm, Weights
 
@@ -36,7 +36,7 @@ def weights(draw: st.DrawFn) -> Weights:
     return Weights(cpu=low, memory=high - low, network=1.0 - high)
 
 
-@pytest.mark.parametrize("module", [utility, standing, fleet])
+@pytest.mark.parametrize("module", [utility, standing, endpoint])
 def test_the_worked_examples_in_the_docstrings_hold(module: object) -> None:
     result = doctest.testmod(module)  # type: ignore[arg-type]  # parametrisation loses the module's type
 
