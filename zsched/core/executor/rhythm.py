@@ -4,8 +4,8 @@ Knows: the counters of this robot's relay. Does not know: what a worker is, why 
 
 A worker may hang, and a way may carry beats and let nothing large through: either way inputs flow and answers end. The
 library acknowledges each input, so there the oldest one under way tells; of any other program the outputs do. A task
-that has not answered yet, or has no outputs, is never judged. To a robot an owner that has ceased to answer is one that
-its streams do not reach (docs/decisions/0114).
+that has hardly answered yet, or has no outputs, is never judged. To a robot an owner that has ceased to answer is one
+that its streams do not reach (docs/decisions/0114).
 
 Where the file says how soon a task answers (`output_deadline_s`) that counts in place of its rhythm, and is reported to
 the owner (`zsched.core.executor.progress`).
@@ -30,6 +30,8 @@ LEAST_S: Final = 3.0
 """However quickly a task answers, it may be silent for so long..."""
 HUNG_TIMES: Final = 16.0
 """...and for so many times as long as its answers come apart on the mean."""
+ENOUGH: Final = 8
+"""So many outputs tell how a program answers that acknowledges nothing."""
 
 
 class Rhythm(Struct):
@@ -47,10 +49,11 @@ class Rhythm(Struct):
     """When an answer of this owner was counted last."""
     waits_since: float | None = None
     """When an input that has no answer yet was seen; ``None``: none waits."""
+    is_acknowledged: bool = False
     mark: int = 0
     """Of acknowledged inputs: once so many are done, that one has its answer."""
     longest_s: float = 0.0
-    """The longest wait that an output of the same owner has ended: the task answers now and then."""
+    """The longest wait that an output has ended, whoever owned the task: it answers now and then."""
     fled_s: float = 0.0
     """How long an owner was waited for that was left then: if the next one does no better, the fault is elsewhere."""
 
@@ -62,12 +65,14 @@ class Rhythm(Struct):
             self.waits_since = self.given_at = None
             return
         self.taken_at = now if taken > before[0] else self.taken_at
+        self.is_acknowledged = in_flight is not None
         if in_flight is not None:
             if taken - in_flight >= self.mark or self.waits_since is None:
                 self.mark, self.waits_since = taken, now if in_flight else None
         elif given > before[1]:
             waited_s = 0.0 if self.waits_since is None else now - self.waits_since
-            self.longest_s, self.waits_since = max(self.longest_s, waited_s), None
+            self.longest_s, self.waits_since = max(self.longest_s, self.fled_s + waited_s), None
+            self.fled_s = 0.0
         elif taken > before[0] and self.waits_since is None:
             self.waits_since = now
         if given > before[1]:
@@ -89,10 +94,11 @@ class Rhythm(Struct):
 
     def overdue_s(self, now: float) -> float | None:
         """For how long no answer has come that should have, while inputs flow; ``None``: not too long."""
-        if self.waits_since is None or not self.answers or self.taken_at == self.waits_since:
+        enough, times = (1, 2.0) if self.is_acknowledged else (ENOUGH, HUNG_TIMES)
+        if self.waits_since is None or self.answers < enough or self.taken_at == self.waits_since:
             return None
         gap_s = (self.flowed_s - (now - self.waits_since)) / self.answers
-        return self.waited_s(now, max(LEAST_S, HUNG_TIMES * gap_s, 2.0 * self.longest_s, 2.0 * self.fled_s))
+        return self.waited_s(now, max(LEAST_S, HUNG_TIMES * gap_s, 2.0 * self.longest_s, times * self.fled_s))
 
 
 class Progress:

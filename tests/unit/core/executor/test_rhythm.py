@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
@@ -121,20 +122,57 @@ def test_large_samples_that_do_not_come_through_are_seen_though_some_of_them_do(
     assert robot.run(5.0, in_hz=12.0, out_hz=1.8)
 
 
-def test_if_the_next_owner_does_no_better_each_one_is_waited_for_twice_as_long() -> None:
-    robot = Robot()
+@pytest.mark.parametrize(("acknowledges", "ratio"), [(True, 2.0), (False, HUNG_TIMES)])
+def test_if_the_next_owner_does_no_better_each_one_is_waited_for_longer(*, acknowledges: bool, ratio: float) -> None:
+    robot = Robot(acknowledges=acknowledges)
     robot.run(20.0, out_hz=10.0)
     times = []
-    for _ in range(4):
+    for _ in range(4 if acknowledges else 2):
         began = robot.now
         while robot.overdue_s is None:
             robot.run(1.0)
         times.append(robot.now - began)
         robot.move()
         robot.run(1.0)
-    assert [second / first for first, second in itertools.pairwise(times)] == pytest.approx([2.0] * 3, abs=0.6)
+    assert [second / first for first, second in itertools.pairwise(times)] == pytest.approx(
+        [ratio] * (len(times) - 1), rel=0.3
+    )
+    robot.given = robot.taken
     robot.run(200.0, out_hz=10.0)
-    assert robot.run(LEAST_S + 1.0), "that is forgiven"
+    assert robot.run(LEAST_S + 1.0) is acknowledges, "that is forgiven where acknowledgements tell"
+
+
+def escapes(schedule: Iterable[tuple[float, float]]) -> list[float]:
+    """When a task was left that answers so ((seconds, answers a second) in turn), while inputs flow."""
+    robot, found = Robot(), list[float]()
+    for seconds, out_hz in schedule:
+        for _ in range(round(seconds)):
+            if robot.run(1.0, out_hz=out_hz):
+                found.append(robot.now - 100.0)
+                robot.move()
+    return found
+
+
+@pytest.mark.parametrize("schedule", [((60.0, 10.0), (120.0, 0.0)), ((20.0, 10.0), (20.0, 0.0))])
+def test_a_task_that_answers_in_bursts_is_left_twice_at_most(schedule: tuple[tuple[float, float], ...]) -> None:
+    """An answer of the next owner ends the wait, too; no steady time of answers makes that forgotten."""
+    assert len(escapes(schedule * 40)) in {1, 2}
+
+
+def test_a_task_that_answers_seldom_is_not_judged_by_its_first_answers() -> None:
+    seldom = ((1.0, 0.0), (1.0, 1.0), *((59.0, 0.0), (1.0, 1.0)) * 40)
+    assert escapes(seldom) == []
+
+
+def test_the_next_owner_s_answer_tells_how_long_the_task_may_be_silent() -> None:
+    robot = Robot()
+    robot.run(20.0, out_hz=10.0)
+    assert robot.run(LEAST_S + 1.0)
+    robot.move()
+    robot.run(20.0)
+    robot.run(300.0, out_hz=10.0)
+    assert not robot.run(40.0)
+    assert robot.run(10.0), "and who answers no more is seen all the same"
 
 
 def test_a_handover_and_another_life_of_the_worker_owe_nothing() -> None:
