@@ -72,7 +72,7 @@ from zsched.runtime.session_watch import SessionWatch
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Shell
 from zsched.runtime.strikes import Strikes
-from zsched.runtime.zenoh_file import operator_json5
+from zsched.runtime.zenoh_file import denied_by, operator_json5
 from zsched.screen import fitted
 from zsched.sessions import config as zenoh_config
 
@@ -231,7 +231,10 @@ class Daemon:
 
     def _read_settings(self) -> None:
         """What hangs on the fleet in force, and is the same for as long as the process lives."""
-        self._protocol = daemon_tls.protocol_of(self._fleet, operator_json5(self._fleet))
+        text = operator_json5(self._fleet)
+        for fault in denied_by(self._fleet, text)[1]:
+            log.warning("zenoh_file %s; %s", fault.message, fault.hint)
+        self._protocol = daemon_tls.protocol_of(self._fleet, text)
         self._texts = {side: daemon_tls.session_text(self._fleet, side) for side in Side}
         if self._fleet.security is not None:
             require_own(self._fleet, self._fleet.security, self._spec.name)

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from typing import Any, Final
 
-from zsched.core.route.keyexpr import includes
+from zsched.core.route.keyexpr import includes, intersects
 from zsched.core.route.ros2 import BUFFERS, is_rmw_key
 from zsched.core.route.route import widened
 from zsched.core.values.certificates import Role, accepted
@@ -79,11 +79,12 @@ def access_control(fleet: Fleet, security: Security, side: Side) -> Json:
     }
 
 
-def first_denied(fleet: Fleet, rules: Json) -> tuple[str, str, str] | None:
-    """What the fleet needs and an operator's own ``access_control`` lets nobody do: (message, flow, key).
+def first_denied(fleet: Fleet, rules: Json) -> tuple[bool, str, str, str] | None:
+    """What the fleet needs, and no rule of the ``access_control`` lets all do: (for sure, message, flow, key).
 
     Whom a rule is for only the link tells. So a rule that allows counts for everybody, and one that denies does not
-    count where its subject is narrower than everybody.
+    count where its subject is narrower than everybody. Narrow rules may allow together what none allows alone: for sure
+    is what a rule denies, and a key of which no rule allows any part.
     """
     held = {rule["id"]: rule for rule in rules.get("rules") or ()}
     everybody = {one["id"] for one in rules.get("subjects") or () if not any(one[name] for name in one if name != "id")}
@@ -102,12 +103,15 @@ def first_denied(fleet: Fleet, rules: Json) -> tuple[str, str, str] | None:
             for expr in rule["key_exprs"]
         )
 
-    is_open = rules["default_permission"] == "allow"
+    is_open, doubtful = rules["default_permission"] == "allow", None
     for message, key in _needs(fleet):
+        is_shut = not is_open and not any(intersects(expr, key) for rule in allows for expr in rule["key_exprs"])
         for flow in FLOWS:
-            if has(denies, message, flow, key) or not (is_open or has(allows, message, flow, key)):
-                return message, flow, key
-    return None
+            if is_shut or has(denies, message, flow, key):
+                return True, message, flow, key
+            if doubtful is None and not (is_open or has(allows, message, flow, key)):
+                doubtful = False, message, flow, key
+    return doubtful
 
 
 def _needs(fleet: Fleet) -> Iterator[tuple[str, str]]:

@@ -42,7 +42,7 @@ def operator_json5(fleet: Fleet) -> str:
     """The text of the operator's zenoh file; empty when the fleet file names none.
 
     Raises:
-        ConfigError: it cannot be read, or the fleet cannot work with it.
+        ConfigError: it cannot be read, or no fleet can work with it.
     """
     text = _read(fleet.zenoh_config) if fleet.zenoh_config else ""
     if faults := faults_of(fleet, text):
@@ -56,8 +56,9 @@ def judged(result: CheckResult) -> CheckResult:
     if fleet is None or not fleet.zenoh_config or not Path(fleet.zenoh_config).is_file():
         return result  # `check_file` has said that it is not here
     text = _read(fleet.zenoh_config)
-    if faults := faults_of(fleet, text):
-        return replace(result, fleet=None, faults=(*result.faults, *faults))
+    is_sure, denied = (False, ()) if (faults := faults_of(fleet, text)) else denied_by(fleet, text)
+    if faults or is_sure:
+        return replace(result, fleet=None, faults=(*result.faults, *faults, *denied))
     said = {path: setting(text, path) for path in OURS}
     usual = {path: setting("{}", path) for path in OURS} | {"mode": "peer"}
     unused = [
@@ -65,7 +66,7 @@ def judged(result: CheckResult) -> CheckResult:
         for path, where in OURS.items()
         if said[path] not in (None, False, [], usual[path])
     ]
-    return replace(result, warnings=(*result.warnings, *unused))
+    return replace(result, warnings=(*result.warnings, *denied, *unused))
 
 
 def _read(file: str) -> str:
@@ -79,7 +80,7 @@ def _read(file: str) -> str:
 
 
 def faults_of(fleet: Fleet, text: str) -> tuple[Fault, ...]:
-    """Why ``fleet`` cannot work with a zenoh file that says ``text``."""
+    """Why no session is opened with a zenoh file that says ``text``."""
     file = fleet.zenoh_config
     try:
         return tuple(Fault(line=0, col=0, message=what, hint=hint, file=file) for what, hint in _misfits(fleet, text))
@@ -101,9 +102,16 @@ def _misfits(fleet: Fleet, text: str) -> Iterator[tuple[str, str]]:
     if fleet.security is not None and (rules.get("enabled") or tls_settings(text)):
         message = "it sets TLS or access control, and the fleet file has a `security:` section, which makes both"
         yield message, "keep one of them"
-    elif rules.get("enabled") and (denied := first_denied(fleet, rules)):
-        message, flow, key = denied
-        yield (
-            f"`access_control` denies {message} ({flow}) of {key!r}, which this fleet needs",
-            f"allow it, for example by the key expression {key!r} (`**` holds no chunk that begins with @)",
-        )
+
+
+def denied_by(fleet: Fleet, text: str) -> tuple[bool, tuple[Fault, ...]]:
+    """(whether for sure, what the ``access_control`` of a zenoh file without faults denies this fleet)."""
+    rules = setting(text, "access_control") or {}
+    found = first_denied(fleet, rules) if rules.get("enabled") else None
+    if found is None:
+        return False, ()
+    is_sure, message, flow, key = found
+    verb = "denies" if is_sure else "may deny"
+    what = f"`access_control` {verb} {message} ({flow}) of {key!r}, which this fleet needs"
+    hint = f"allow it, for example by the key expression {key!r} (`**` holds no chunk that begins with @)"
+    return is_sure, (Fault(line=0, col=0, message=what, hint=hint, file=fleet.zenoh_config),)

@@ -22,7 +22,7 @@ from zsched.core.values.fleet import Fleet, Security
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_CONFIG
 from zsched.runtime.access_rules import ALL
-from zsched.runtime.zenoh_file import faults_of, judged, operator_json5
+from zsched.runtime.zenoh_file import denied_by, faults_of, judged, operator_json5
 
 FILE = "/etc/zsched/zenoh.json5"
 FLEET = """
@@ -57,15 +57,33 @@ def rules(*keys: str, permission: str = "allow", default: str = "deny", **subjec
         ('{id: "aabb"}', "`id`"),
         ('{namespace: "robot3"}', "`namespace`"),
         ("{transport: {unicast: {lowlatency: true}}}", "lowlatency"),
-        ('{access_control: {enabled: true, default_permission: "deny"}}', "denies put (ingress) of '@zsched/hall/"),
-        (rules("**"), "'@zsched/hall/*/robot1/**'"),
-        (rules("@zsched/other/**"), "'@zsched/hall/*/robot1/**'"),
-        (rules("@zsched/*/*/robot1/**", permission="deny", default="allow"), "'@zsched/hall/*/robot1/**'"),
     ],
 )
 def test_a_file_that_no_fleet_could_work_with_is_a_fault(text: str, words: str) -> None:
     (fault,) = faults_of(fleet(), text)
     assert words in fault.render(FILE)
+
+
+NARROW = rules(*(f"@zsched/hall/{kind}/**" for kind in ("beat", "profile", "alive", "status")), "*/scan", "*/merge/**")
+"""What an operator writes who allows each kind by itself."""
+
+
+@pytest.mark.parametrize(
+    ("text", "is_sure"),
+    [
+        ('{access_control: {enabled: true, default_permission: "deny"}}', True),
+        (rules("**"), True),
+        (rules("@zsched/other/**"), True),
+        (rules("@zsched/*/*/robot1/**", permission="deny", default="allow"), True),
+        (rules("@zsched/*/beat/robot1", permission="deny", default="allow"), None),
+        (NARROW, False),
+    ],
+)
+def test_the_first_key_that_is_denied_is_named_and_whether_that_is_sure(text: str, *, is_sure: bool | None) -> None:
+    assert faults_of(fleet(), text) == ()
+    found, faults = denied_by(fleet(), text)
+    key = "put (ingress) of '@zsched/hall/*/robot1/**'"
+    assert (found, [key in one.message for one in faults]) == (bool(is_sure), [] if is_sure is None else [True])
 
 
 @pytest.mark.parametrize(
@@ -81,7 +99,7 @@ def test_a_file_that_no_fleet_could_work_with_is_a_fault(text: str, words: str) 
     ],
 )
 def test_what_a_fleet_works_with_is_none(text: str) -> None:
-    assert faults_of(fleet(), text) == ()
+    assert (faults_of(fleet(), text), denied_by(fleet(), text)) == ((), (False, ()))
 
 
 def test_tls_or_rules_do_not_go_with_a_security_section() -> None:
@@ -110,6 +128,15 @@ def test_the_rules_are_tried_against_this_fleet_s_own_streams(tmp_path: Path) ->
     assert "error" not in report(tmp_path, rules("@zsched/**", "*/scan", "*/merge/**"))
 
 
+def test_rules_that_may_allow_it_together_are_a_warning(tmp_path: Path) -> None:
+    said = report(tmp_path, NARROW)
+    assert "error" not in said
+    assert "warning: `access_control` may deny put (ingress) of '@zsched/hall/*/robot1/**'" in said
+    assert CliRunner().invoke(app, ["check", str(tmp_path / "fleet.yaml")]).exit_code == 0
+    report(tmp_path, rules("**"))
+    assert CliRunner().invoke(app, ["check", str(tmp_path / "fleet.yaml")]).exit_code == EXIT_CONFIG
+
+
 def test_settings_that_are_not_used_are_named(tmp_path: Path) -> None:
     ours = '{mode: "peer", listen: {endpoints: {router: ["tcp/[::]:7447"], peer: ["tcp/[::]:0"]}}}'
     assert "is not used" not in report(tmp_path, ours), "as in zenoh's own example of a file"
@@ -118,14 +145,28 @@ def test_settings_that_are_not_used_are_named(tmp_path: Path) -> None:
     assert "`transport/link/tx/lease` is not used: `timing:`" in said
 
 
-def test_a_start_with_such_a_file_ends_with_its_code(tmp_path: Path) -> None:
-    """With `lowlatency` zenoh panicked, and every daemon but the first lived on without its socket."""
+def started(tmp_path: Path, text: str) -> subprocess.CompletedProcess[str]:
+    """A daemon that does not start with this zenoh file, and ends by itself."""
     (tmp_path / "fleet.yaml").write_text(FLEET)
-    (tmp_path / "zenoh.json5").write_text("{transport: {unicast: {lowlatency: true, qos: {enabled: false}}}}")
+    (tmp_path / "zenoh.json5").write_text(text)
     folders = ["--config", tmp_path / "fleet.yaml", "--state-dir", tmp_path / "state", "--runtime-dir", tmp_path]
     command = [sys.executable, "-m", "zsched.daemon", "--node", "robot1", *map(str, folders)]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_start_with_such_a_file_ends_with_its_code(tmp_path: Path) -> None:
+    """With `lowlatency` zenoh panicked, and every daemon but the first lived on without its socket."""
+    ended = started(tmp_path, "{transport: {unicast: {lowlatency: true, qos: {enabled: false}}}}")
     assert (ended.returncode, "lowlatency" in ended.stderr) == (EXIT_CONFIG, True)
+
+
+@pytest.mark.parametrize("text", [NARROW, rules("**")])
+def test_a_start_with_rules_that_deny_something_warns_and_goes_on(tmp_path: Path, text: str) -> None:
+    """It goes on to the TLS of the same file, with which it cannot listen: so it ends before it opens a session."""
+    tls = {"transport": {"link": {"tls": {"root_ca_certificate": "/none.pem"}}}}
+    ended = started(tmp_path, json.dumps(json.loads(text) | tls))
+    assert (ended.returncode, "TLS without listen_certificate" in ended.stderr) == (EXIT_CONFIG, True), ended.stderr
+    assert "of '@zsched/hall/*/robot1/**', which this fleet needs" in ended.stderr
 
 
 def test_check_and_apply_refuse_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
