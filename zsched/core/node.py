@@ -81,7 +81,7 @@ class Node(Stages):
             executor.start(todo)
             value = self.registers[name].value
             if value.revision > 0:
-                work.take(self, value, "known from before the restart", todo, now, is_known=True)
+                work.take_known(self, value, "known from before the restart", todo, now)
         return self._finish(now)
 
     def handle(self, event: ev.Event, now: float) -> tuple[do.Instruction, ...]:
@@ -141,8 +141,6 @@ class Node(Stages):
         todo, self._todo = self._todo, ToDo(must_beat=self._todo.must_beat, must_decide=self._todo.must_decide)
         if todo.stand_down is not None:
             todo.add(todo.stand_down)
-        if todo.must_keep:
-            self.agreement.keep(now)
         state = self.agreement.to_persist(now) if todo.must_persist else None
         first: tuple[do.Instruction, ...] = () if state is None else (do.PersistState(state=state),)
         # A limit that shrank may lie in the past already; that is no lag of this loop.
@@ -273,4 +271,5 @@ class Node(Stages):
                 todo.must_beat = True
                 todo.add(do.PublishLearnt(learnt=word))
         for value, reason in learnt:
-            work.take(self, value, reason, todo, now)
+            self.unconfirmed.pop(value.task, None)
+            work.carry_out(self, value, reason, todo, now)

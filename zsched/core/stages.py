@@ -190,8 +190,8 @@ class Stages:
             flags=flags,
         )
         self.registers = self.agreement.registers
-        self.unconfirmed: dict[TaskId, tuple[str, bool]] = {}
-        """{task whose value is not carried out yet: (why it came about, whether it was known at the start)}."""
+        self.unconfirmed: dict[TaskId, str] = {}
+        """{task whose stored value is not carried out yet: how it is known}."""
         self.disks = Disks()
         self.retuning = Retuning(me)
         self.expiry = Expiry(rank=self.flags.rank)

@@ -232,7 +232,7 @@ def _no_quorum(node: Stages, quorum: QuorumStatus, now: float, *, is_left_behind
 def _drastic(node: Stages, advice: str, since: float, now: float) -> str:
     """Advice that gives up what a fleet remembers: none while its cause is young, or a disk only has to be freed."""
     has_stood = now >= since + DRASTIC_AFTER_S
-    return advice if has_stood and not node.disks.refusal and not node.disks.refusals() else ""
+    return advice if has_stood and not node.disks.refusal and not _refusing(node) else ""
 
 
 def _behind(node: Stages, now: float) -> Iterator[str]:
@@ -312,12 +312,20 @@ def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:
 def _disk_problems(node: Stages) -> Iterator[str]:
     """Disks on which others wait, and those that refuse: an own refusal is told by the state's line."""
     for name, save_s in node.disks.slow(node.me, node.fleet.timing.ballot_s / 2).items():
+        if name != node.me and node.membership.state(name) is not PeerState.ALIVE:
+            continue
         yield (
             f"the disk of {name} is slow: a save takes {save_s:.2g} s, and a vote waits for two of them; "
             f"put its state folder on another disk, or look what else writes there: iotop on {name}"
         )
-    for name, why in node.disks.refusals().items():
+    for name, why in _refusing(node).items():
         yield f"the disk of {name} refuses what must be saved: {why}; then start zsched there anew"
+
+
+def _refusing(node: Stages) -> dict[NodeId, str]:
+    """Of the nodes that are there: whose disks refuse a save, and why."""
+    told = node.disks.refusals().items()
+    return {name: why for name, why in told if node.membership.state(name) is PeerState.ALIVE}
 
 
 def _relay_problems(node: Stages, now: float) -> Iterator[str]:

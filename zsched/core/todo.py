@@ -40,8 +40,6 @@ class ToDo(Struct):
 
     must_persist: bool = False
     """The durable state has changed: it is on disk before anything is sent."""
-    must_keep: bool = False
-    """A value is learnt that others hold as well: it is written with the next write, or once the vote is over."""
     must_beat: bool = False
     """The other nodes must hear the next beat at once."""
     must_decide: bool = False

@@ -224,9 +224,9 @@ REGISTER_BUGS = (
     ),
     _bug(
         "learnt value not persisted before routes",
-        "zsched.core.register.task_register",
-        "return accepted is None or accepted.value.revision < value.revision",
-        "return False",
+        REGISTER,
+        "        todo.must_persist = True\n        self._hand_on",
+        "        self._hand_on",
         _REGISTER,
     ),
     Bug(

@@ -192,11 +192,6 @@ class Invariants:
     def _register(machine: Machine, task: TaskId) -> RegisterState:
         return machine.disk.registers.get(task) or RegisterState(task=task)
 
-    def _remembered(self, machine: Machine, task: TaskId) -> tuple[Allocation, ...]:
-        """What a disk knows of a task: what its elector has accepted it learns again after a restart."""
-        held = self._register(machine, task)
-        return tuple(value for value in (held.learnt, held.accepted and held.accepted.value) if value)
-
     def _check_answer(self, machine: Machine, answer: Promise | Accepted, now: float) -> None:
         seat = None if machine.node is None else machine.node.agreement.is_elector
         if not machine.is_elector and not seat:
@@ -270,13 +265,15 @@ class Invariants:
     def _check_told(self, machine: Machine, task: TaskId, revision: int) -> None:
         if not revision % GENERATION_STEP or not _keeps_state(machine):
             return  # a generation's first value is no secret: a task that is new in the fleet file begins with it
-        if all(value.revision < revision for value in self._remembered(machine, task)):
+        learnt = self._register(machine, task).learnt
+        if learnt is None or learnt.revision < revision:
             raise InvariantError(f"{machine.key} told of {task} revision {revision}, which is not on its disk")
 
     def _check_epoch(self, machine: Machine, task: TaskId, epoch: int) -> None:
         if not _keeps_state(machine):
             return
-        if all(value.epoch < epoch for value in self._remembered(machine, task)):
+        learnt = self._register(machine, task).learnt
+        if learnt is None or learnt.epoch < epoch:
             raise InvariantError(f"{machine.key} carried out {task} epoch {epoch}, which is not on its disk")
 
     def on_plan(self, machine: Machine, plan: RoutePlan, now: float) -> None:

@@ -334,23 +334,27 @@ def test_a_restarted_owner_that_was_replaced_is_never_told_to_be_active() -> Non
     assert roles == [WorkerRole.IDLE]
 
 
-def test_an_elector_acts_on_nothing_older_than_it_has_accepted() -> None:
-    """A value that is learnt of what this disk has accepted is written later: a restart finds the one before."""
-    held = Acceptance(ballot=ballot(9, "robot2"), value=allocation_of(5, "edge2", 3))
-    state = RegisterState(task="merge", promised=held.ballot, accepted=held, learnt=allocation_of(4, "edge1", 2))
-    node = Node(
-        fleet=FLEET,
-        me="robot1",
-        durable=durable("robot1", state),
-        incarnation=7,
-        electorate=ELECTORATE,
-        rng=Random(1),
-        now=100.0,
-    )
-    assert not of(node.start(100.0), do.ApplyRoutes)
-    (plan,) = of(node.handle(learnt_from("robot2", held.value), 100.1), do.ApplyRoutes)
-    assert plan.plan.current is not None
-    assert plan.plan.current.owner == "edge2"
+def test_a_node_of_another_generation_keeps_no_restarted_owner_from_its_work() -> None:
+    node = make("edge1", learnt=allocation_of(4, "edge1", 2))
+    node.start(100.0)
+    other = replace(beat("robot3", revision=2**32), generation=1)
+    batches = [node.handle(ev.BeatReceived(beat=one), 100.1) for one in (other, beat("robot1"), beat("robot2"))]
+    assert [one.role.role for batch in batches for one in of(batch, do.SetRole)] == [WorkerRole.ACTIVE]
+
+
+def test_a_value_that_is_learnt_in_this_life_is_carried_out_whatever_anybody_tells() -> None:
+    node = started("edge1")
+    node.handle(ev.BeatReceived(beat=beat("robot3", revision=99)), 100.0)
+    told = node.handle(learnt_from("robot2", allocation_of(5, "edge1", 3)), 100.1)
+    assert [one.role.role for one in of(told, do.SetRole)] == [WorkerRole.ACTIVE]
+
+
+def test_an_elector_whose_disk_is_full_still_confirms_what_an_owner_has_stored() -> None:
+    node = make("edge1", learnt=allocation_of(4, "edge1", 2))
+    node.start(100.0)
+    full = replace(beat("robot1", revision=4), has_lost_state=True, disk_refusal="No space left on device")
+    batches = [node.handle(ev.BeatReceived(beat=one), 100.1) for one in (full, beat("robot2", revision=4))]
+    assert [one.role.role for batch in batches for one in of(batch, do.SetRole)] == [WorkerRole.ACTIVE]
 
 
 def learnt_from(peer: str, value: Allocation) -> ev.LearntReceived:

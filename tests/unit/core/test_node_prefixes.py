@@ -25,7 +25,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerSpec, electorate_hash
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accept, Accepted, Learnt, Promise
-from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, NodeId, RegisterState, TaskId
+from zsched.core.values.model import NO_BALLOT, Acceptance, NodeId, RegisterState, TaskId
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim.simulator import Simulator
 
@@ -57,12 +57,6 @@ def register(state: DurableState | None, task: TaskId) -> RegisterState:
     return blank if state is None else next((one for one in state.registers if one.task == task), blank)
 
 
-def remembered(state: DurableState | None, task: TaskId) -> tuple[Allocation, ...]:
-    """What a disk knows of a task: what is accepted on it is learnt again after a restart."""
-    held = register(state, task)
-    return tuple(value for value in (held.learnt, held.accepted and held.accepted.value) if value)
-
-
 def told_values(instruction: do.Instruction) -> list[tuple[TaskId, int]]:
     """(task, revision) of every value that an instruction tells others as learnt."""
     if isinstance(instruction, do.PublishBeat):
@@ -92,17 +86,20 @@ def check_backed(instruction: do.Instruction, state: DurableState | None) -> Non
             assert held.accepted.ballot >= answer.ballot
     if isinstance(instruction, do.PublishBeat):
         for grant in instruction.beat.echoes:
-            known = remembered(state, grant.task)
+            held = register(state, grant.task)
+            known = [value for value in (held.learnt, held.accepted and held.accepted.value) if value]
             assert known, f"granted by what is not on disk: {instruction}"
             newest = max(known, key=lambda value: value.revision)
             assert (newest.owner, newest.epoch) == (grant.owner, grant.epoch), "granted to another one"
     for task, revision in told_values(instruction):
-        is_backed = any(value.revision >= revision for value in remembered(state, task))
-        assert is_backed, f"told what is not on disk: {instruction}"
+        learnt = register(state, task).learnt
+        assert learnt is not None, f"told what is not on disk: {instruction}"
+        assert learnt.revision >= revision, f"told what is not on disk: {instruction}"
     applied = carried_out(instruction)
     if applied is not None:
-        is_backed = any(value.epoch >= applied[1] for value in remembered(state, applied[0]))
-        assert is_backed, f"applied what is not on disk: {instruction}"
+        learnt = register(state, applied[0]).learnt
+        assert learnt is not None, f"applied what is not on disk: {instruction}"
+        assert learnt.epoch >= applied[1], f"applied what is not on disk: {instruction}"
 
 
 def check_order(batch: tuple[do.Instruction, ...]) -> None:

@@ -18,7 +18,7 @@ from typing import Any, Final
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
-from zsched.core.handlers.work import carry_out
+from zsched.core.handlers.work import take_known
 from zsched.core.stages import HISTORY, OWN_FILE, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
@@ -144,7 +144,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         value = values[executor.spec.name]
         if value.revision > 0:
             reason = "placed before the task came into this node's fleet"
-            carry_out(node, value, reason, todo, now, is_known=True)
+            take_known(node, value, reason, todo, now)
 
 
 def _is_of_before(executor: Executor, value: Allocation) -> bool:

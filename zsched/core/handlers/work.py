@@ -13,13 +13,13 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import UNREADY_SHOWN_S, Handler, PastValue, Stages, Unready
-from zsched.core.status import has_quorum
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
 from zsched.core.values.fleet import OnIsolation
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, as_reason, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import WorkerState
+from zsched.core.values.quorum import majority
 from zsched.core.values.words import CREATION_STEP, HAS_RESTED, TOO_FEW_ELECTORS, shown
 
 FIRST_NEWS: Final = "known from a peer, the first news here"
@@ -69,35 +69,40 @@ def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: flo
     todo.must_beat = True
 
 
-def take(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float, *, is_known: bool = False) -> None:
-    """Carry out a learnt value, or keep it until it may be."""
-    node.unconfirmed.pop(value.task, None)
+def take_known(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float) -> None:
+    """Carry out a value that this node's disk tells of, or keep it until it may be."""
     if is_confirmed(node, value):
-        carry_out(node, value, reason, todo, now, is_known=is_known)
+        carry_out(node, value, reason, todo, now, is_known=True)
     else:
-        node.unconfirmed[value.task] = reason, is_known
+        node.unconfirmed[value.task] = reason
 
 
 def take_up(node: Stages, todo: ToDo, now: float) -> None:
     """Carry out what had to wait and is confirmed by now."""
-    for task, (reason, is_known) in tuple(node.unconfirmed.items()):
-        take(node, node.registers[task].value, reason, todo, now, is_known=is_known)
+    waiting, node.unconfirmed = node.unconfirmed, {}
+    for task, reason in waiting.items():
+        take_known(node, node.registers[task].value, reason, todo, now)
 
 
 def is_confirmed(node: Stages, value: Allocation) -> bool:
-    """Whether a value may be carried out: this node has accepted no newer one. Where it is the owner, that is not all.
+    """Whether a stored value may be carried out; what is learnt in this life may be at once.
 
-    What is stored here may be older than the last move: a majority of the electors is heard, since the start, and
-    nobody who is heard knows a newer value. A robot that may work alone does so once it has listened in vain.
+    What is stored may be older than the last move. So nobody is an owner by it before a majority of the electors is
+    heard, of which none knows a newer value. A robot that may work alone does so once it has listened in vain.
     """
-    if node.registers[value.task].is_unlearnt:
-        return False
     if value.owner != node.me:
         return True
-    if any(revision > value.revision for revision in node.membership.told(value.task)):
+    heard = [name for name in node.fleet.electors if name == node.me or _remembers(node, name)]
+    if any(node.membership.learnt(name, value.task) > value.revision for name in heard):
         return False
     may_be_alone = node.fleet.task(value.task).on_isolation is OnIsolation.LOCAL and node.membership.has_watched
-    return node.quorum_at > node.started_at or has_quorum(node) or may_be_alone
+    return may_be_alone or len(heard) >= majority(len(node.fleet.electors))
+
+
+def _remembers(node: Stages, name: NodeId) -> bool:
+    """Whether an elector is heard that knows what it has learnt, though its disk may take nothing more."""
+    is_there = node.membership.state(name) is PeerState.ALIVE and name not in node.agreement.apart
+    return is_there and (name not in node.stateless or name in node.disks.refusals())
 
 
 def _is_first_news(epoch: int, value: Allocation, reason: str) -> bool:

@@ -23,7 +23,7 @@ owner that all others hear.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 
 from zsched.core.sequence import Order, Track
 from zsched.core.values.beat import Beat
@@ -146,10 +146,11 @@ class Membership:
         peer = self._peers.get(node)
         return None if peer is None or peer.track.incarnation < 0 else peer.track.incarnation
 
-    def told(self, task: TaskId) -> Iterator[int]:
-        """The revisions of a task that living peers have learnt, by their newest beats."""
-        living = (peer for peer in self._peers.values() if peer.state is PeerState.ALIVE)
-        return (revision for peer in living for name, revision, _ in peer.learnt if name == task)
+    def learnt(self, node: NodeId, task: TaskId) -> int:
+        """The revision of a task that a peer has learnt, by its newest beat; 0: it tells of none."""
+        peer = self._peers.get(node)
+        told = () if peer is None else peer.learnt
+        return next((revision for name, revision, _ in told if name == task), 0)
 
     def is_doubtful(self, node: NodeId) -> bool:
         """Whether the peer's last beat is not believed."""

@@ -202,11 +202,6 @@ class Register(ABC, Generic[V]):
     def _prevails(self, value: V) -> bool:
         """Whether ``value`` counts more than another first value, which no ballot has brought."""
 
-    def _must_write(self, value: V) -> bool:
-        """Whether a learnt value is on disk before anything follows from it, rather than soon (`ToDo.must_keep`)."""
-        del value
-        return True
-
     @abstractmethod
     def _replaces(self, change: Rewrite[V]) -> bool:
         """Whether ``change`` may be applied to a value that no majority of electors takes."""
@@ -352,8 +347,7 @@ class Register(ABC, Generic[V]):
         if not self._is_unlearnt():
             self._settle_at = math.inf
         outcome = self._outcome_by(value)
-        todo.must_persist |= self._must_write(value)
-        todo.must_keep = True
+        todo.must_persist = True
         self._hand_on(value, self._why(outcome), todo)
         if outcome is not None:
             self._finish(todo, outcome, now)
@@ -652,6 +646,8 @@ class Register(ABC, Generic[V]):
                 self._prepare(todo, now)  # no newer value has come: that would have ended the round
             elif running.phase is _Phase.HELD:
                 self._give_up(running, todo, now)
+            elif Refusal.BALLOT in running.no.values():
+                self._again(running, todo, now)  # who has promised more than we have answers nothing else
             else:
                 self._ask_again(running, todo, now)
         elif running is None and now >= self._settle_at:

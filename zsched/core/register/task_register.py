@@ -35,11 +35,6 @@ class TaskRegister(Register[Allocation]):
         """First values of a generation are equal but for their leases: what is not leased for one is so for nobody."""
         return not value.leased
 
-    def _must_write(self, value: Allocation) -> bool:
-        """What this node has accepted its disk remembers: it acts on nothing older, and learns it again."""
-        accepted = self.state.accepted
-        return accepted is None or accepted.value.revision < value.revision
-
     def _replaces(self, change: Rewrite[Allocation]) -> bool:
         return isinstance(change, MoveOwner)
 

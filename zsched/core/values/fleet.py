@@ -59,7 +59,9 @@ ORDER_BALLOTS = 14.0
 """And for so many times ``ballot_s``: a round is given up 6 of them after it began, and its last phase may take one
 more; a round that is under way is waited for first."""
 PACED_SAVES = 3.0
-"""A phase of a vote may take so many saves of the electors' disks."""
+"""A phase of a vote may take so many saves of the electors' disks..."""
+MOST_PACED_S = 5.0
+"""...and this long at most: one stall of a disk that is quick says nothing of the next save."""
 SECONDS = Range(0.01, 3600, "s")
 DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
 
@@ -374,7 +376,7 @@ class Timing:
 
         An answer may wait for a save that is under way and then for its own; the next proposer steps in behind both.
         """
-        least_s = PACED_SAVES * save_s
+        least_s = min(PACED_SAVES * save_s, MOST_PACED_S)
         return replace(self, ballot_s=max(self.ballot_s, least_s), stagger_s=max(self.stagger_s, least_s))
 
     @property

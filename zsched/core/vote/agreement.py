@@ -151,7 +151,6 @@ class Agreement:
             may_elect = durable is not None and not self._disputed and not self._lost
             self._numbers.begin(self.generation, self._by_file, self.at_start, now, may_elect=may_elect)
         self._settle_at = now + SETTLE_AFTER_START_S if is_elector else math.inf
-        self._keep_at = math.inf
         """When what was learnt is written at the latest."""
         self._questions = Questions()
         self.leases = Leases(
@@ -332,7 +331,7 @@ class Agreement:
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""
-        due = min(self._settle_at, self._keep_at, self._numbers.next_deadline())
+        due = min(self._settle_at, self._numbers.next_deadline())
         for register in self.registers.values():
             if (at := register.next_deadline()) < due:
                 due = at
@@ -352,16 +351,10 @@ class Agreement:
         """{task: the newest value here}: an elector that does not know when it granted accepts only this owner."""
         return {name: register.newest for name, register in self.registers.items()}
 
-    def keep(self, now: float) -> None:
-        """Something is learnt that must be on disk once the vote about it is over: a write now would hold that up."""
-        if self._durable is not None:
-            self._keep_at = min(self._keep_at, now + 2 * self.timing.ballot_s)
-
     def to_persist(self, now: float) -> DurableState | None:
         """The state to write now, or ``None`` when this node keeps none."""
         if self._durable is None:
             return None
-        self._keep_at = math.inf
         states = tuple(self.registers[name].state for name in sorted(self.registers))
         self._durable = replace(
             self._durable,
@@ -845,7 +838,6 @@ class Agreement:
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
-        todo.must_persist |= now >= self._keep_at
         if now >= self._settle_at:
             self._numbers.settle(todo, now)
         if now >= self._numbers.next_deadline():
@@ -876,7 +868,7 @@ class Agreement:
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""
         self._problems["state"] = f"{reason}; this node is no elector until it is restarted"
-        self._durable, self._keep_at = None, math.inf
+        self._durable = None
         self._stop_electing()
 
     def _stop_electing(self) -> None:

@@ -53,11 +53,12 @@ class Voting:
         self._commit_rank = 0
         self.awaited_until = -math.inf
         """A vote on a move was won: until when its value should be learnt."""
+        self._timing = fleet.timing
         self.adopt(fleet)
 
     def adopt(self, fleet: Fleet) -> None:
-        """Take the robots and the times of a vote from ``fleet``; what a robot proposed that left does not count."""
-        self._voters, self._timing = fleet.voters, fleet.timing
+        """Take the robots of a vote from ``fleet``; what a robot proposed that left does not count. `pace` follows."""
+        self._voters = fleet.voters
         self._vote_s = vote_time(fleet.timing)
         self.proposals = {voter: known for voter, known in self.proposals.items() if voter in self._voters}
 

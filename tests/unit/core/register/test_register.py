@@ -98,16 +98,14 @@ def test_a_prepare_or_accept_that_is_said_again_changes_nothing() -> None:
     assert register.state == newer
 
 
-@pytest.mark.parametrize(("held", "is_dirty"), [(1, False), (None, True)], ids=["accepted", "not accepted"])
-def test_what_is_learnt_is_written_at_once_unless_it_is_accepted_on_this_disk(
-    held: int | None, *, is_dirty: bool
-) -> None:
+@pytest.mark.parametrize("held", [1, None], ids=["accepted", "not accepted"])
+def test_what_is_learnt_is_written_before_anything_follows(held: int | None) -> None:
     register = make()
     if held is not None:
         accepted(register, accept(1, allocation(held)), 0.0)
     todo = ToDo()
     register.learn(allocation(1), todo, 0.0)
-    assert (todo.must_persist, todo.must_keep) == (is_dirty, True)
+    assert todo.must_persist
 
 
 def test_accept_under_a_higher_ballot_than_promised_raises_the_promise() -> None:

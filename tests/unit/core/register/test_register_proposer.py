@@ -128,6 +128,19 @@ def test_a_proposer_that_waits_for_slow_disks_keeps_its_ballot() -> None:
     assert last(did(proposer.on_answer, answer, BALLOT_S) for _, answer in answers).accept is not None
 
 
+def test_one_elector_that_has_promised_more_is_asked_above_that_although_another_is_dead() -> None:
+    proposer, other = make("r1"), make("r2")
+    promised(other, prepare(9))
+    asked = did(proposer.propose, FIRST, 0.0)
+    assert asked.prepare is not None
+    promised(proposer, asked.prepare)
+    did(proposer.on_answer, promised(other, asked.prepare)[1], 0.0)
+    did(proposer.tick, BALLOT_S)
+    again = did(proposer.tick, proposer.next_deadline())
+    assert again.prepare is not None
+    assert again.prepare.ballot.counter > 9
+
+
 def test_what_a_proposer_s_own_loop_stands_still_is_not_taken_from_its_change() -> None:
     proposer = make("r1")
     did(proposer.propose, FIRST, 0.0)
