@@ -16,14 +16,13 @@ from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, RemoveElector, SetDocument
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.todo import ToDo
-from zsched.core.values.change import Rewrite, RoundOutcome
+from zsched.core.values.change import Rewrite, RoundOutcome, told_end
 from zsched.core.values.document import Document, Flag, in_the_name_of
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 from zsched.core.values.model import as_reason, told_by
 from zsched.core.values.struct import replace
-from zsched.core.values.words import told_of_silence
 
 MAX_OPEN = 16
 """Operators' commands that may wait for their documents; of more the oldest ends, and its operator is answered so."""
@@ -31,12 +30,7 @@ MAX_OPEN = 16
 MAX_STORY = 500
 """Characters of a line of the journal: a text on the wire has at most 512."""
 
-_ENDED = {
-    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
-    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "that is what is agreed"),
-    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, ""),
-    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
-}
+_UNCHANGED = "that is what is agreed"
 
 
 class Orders:
@@ -142,11 +136,11 @@ class Orders:
         if outcome is RoundOutcome.COMMITTED:
             self._answer(request, CommandOutcome.OK, _committed(value), todo, value.revision)
             return
-        kind, detail = _ENDED[outcome]
-        detail = detail or told_of_silence(len(value.electors))
-        fault = self._numbers.fault(change) if outcome is RoundOutcome.UNCHANGED else ""
-        if fault:
-            kind, detail = CommandOutcome.INVALID, fault
+        kind, detail = told_end(outcome, len(value.electors))
+        if outcome is RoundOutcome.UNCHANGED:
+            detail = _UNCHANGED
+            if fault := self._numbers.fault(change):
+                kind, detail = CommandOutcome.INVALID, fault
         self._answer(request, kind, detail, todo, value.revision)
 
     @staticmethod

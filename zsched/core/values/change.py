@@ -9,8 +9,10 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Protocol, TypeVar
 
+from zsched.core.values.messages import CommandOutcome
 from zsched.core.values.model import Allocation, Asked, NodeId, Pause, Pin, TaskId, Tuning, told_by
 from zsched.core.values.struct import Struct, replace
+from zsched.core.values.words import told_of_silence
 
 _Value = TypeVar("_Value")
 
@@ -129,6 +131,17 @@ class RoundOutcome(StrEnum):
     UNCHANGED = "unchanged"  # it asks for what is there already: nothing was written
     NO_QUORUM = "no_quorum"  # not started: no majority promised
     UNKNOWN = "unknown"  # some elector may have it, and no majority could be asked
+
+
+def told_end(outcome: RoundOutcome, electors: int) -> tuple[CommandOutcome, str]:
+    """How a change has ended among so many electors, for its operator."""
+    return {
+        RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
+        RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
+        RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
+        RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, told_of_silence(electors)),
+        RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
+    }[outcome]
 
 
 class Ended(Struct, frozen=True, kw_only=True):

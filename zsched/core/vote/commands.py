@@ -1,4 +1,4 @@
-"""VOTE, an operator's change of a task: which change it asks for, and the answer when that has ended.
+"""VOTE, an operator's change: the answer when it has ended.
 
 Knows: commands, outcomes in words. Does not know: rounds (`zsched.core.register.register`), how an answer travels.
 """
@@ -7,18 +7,9 @@ from __future__ import annotations
 
 from zsched.core import instructions as do
 from zsched.core.todo import ToDo
-from zsched.core.values.change import Ended, RoundOutcome, SetLeased
+from zsched.core.values.change import Ended, SetLeased, told_end
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import Allocation
-from zsched.core.values.words import told_of_silence
-
-_ENDED = {
-    RoundOutcome.COMMITTED: (CommandOutcome.OK, "committed by a majority of the electors"),
-    RoundOutcome.CONFLICT: (CommandOutcome.CONFLICT, "another change came first"),
-    RoundOutcome.UNCHANGED: (CommandOutcome.UNCHANGED, "it is so already"),
-    RoundOutcome.NO_QUORUM: (CommandOutcome.NO_QUORUM, ""),
-    RoundOutcome.UNKNOWN: (CommandOutcome.UNKNOWN, "the electors fell silent"),
-}
 
 
 def refuse_gone(ended: Ended, todo: ToDo) -> None:
@@ -30,9 +21,8 @@ def refuse_gone(ended: Ended, todo: ToDo) -> None:
 def answer_end(ended: Ended, value: Allocation, todo: ToDo, electors: int) -> None:
     """Tell the operator who waits for a change how it has ended; ``value`` is the present one, of so many electors."""
     if not isinstance(ended.change, SetLeased) and ended.change.request is not None:
-        kind, detail = _ENDED[ended.outcome]
-        told = f"{ended.task}: {detail or told_of_silence(electors)}"
-        result = CommandResult(outcome=kind, detail=told, revision=value.revision)
+        kind, detail = told_end(ended.outcome, electors)
+        result = CommandResult(outcome=kind, detail=f"{ended.task}: {detail}", revision=value.revision)
         todo.add(do.AnswerCommand(request=ended.change.request, result=result))
 
 
