@@ -213,12 +213,9 @@ class Agreement:
         kept, for the task may come back.
         """
         self._timing = fleet.timing
-        fleet = replace(fleet, timing=fleet.timing.paced(self.pace_s))
-        self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
-        self.witness.nodes = self._nodes
-        self._numbers.adopt(fleet)
+        self._nodes = self.witness.nodes = frozenset(node.name for node in fleet.nodes)
+        fleet = self._paced(fleet)
         self.strangers.silence_s = fleet.timing.suspect_s
-        self.helm.adopt(stagger_s=HELM_BALLOTS * fleet.timing.ballot_s)
         for node in [node for node in self.behind if node not in self._nodes]:
             self._show_no_more(node)
         kept = dict(self.registers)
@@ -251,13 +248,17 @@ class Agreement:
 
     def pace(self, save_s: float) -> None:
         """Go by clocks that leave room for saves of ``save_s``."""
-        self.pace_s, timing = save_s, self._timing.paced(save_s)
-        self._fleet = replace(self._fleet, timing=timing)
-        self._numbers.adopt(self._fleet)
-        self.helm.adopt(stagger_s=HELM_BALLOTS * timing.ballot_s)
-        self.acceptor.adopt(self._fleet)
+        self.pace_s = save_s
+        self.acceptor.adopt(self._paced(self._fleet))
         for register in self.registers.values():
-            register.adopt_clocks(ballot_s=timing.ballot_s, stagger_s=timing.stagger_s)
+            register.adopt_clocks(ballot_s=self.timing.ballot_s, stagger_s=self.timing.stagger_s)
+
+    def _paced(self, fleet: Fleet) -> Fleet:
+        """Go by ``fleet``, with clocks that leave room for the disks."""
+        self._fleet = replace(fleet, timing=self._timing.paced(self.pace_s))
+        self._numbers.adopt(self._fleet)
+        self.helm.adopt(stagger_s=HELM_BALLOTS * self.timing.ballot_s)
+        return self._fleet
 
     @property
     def _by_file(self) -> str:
