@@ -7,7 +7,7 @@ does to the fleet (`zsched.config.difference`), how it is agreed.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -15,7 +15,7 @@ from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, warn
 from zsched.core.values.struct import Struct
-from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_TIMED_OUT
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 
 UNKNOWING = "it does not know the fleet's generation yet"
 """Of a node that tells no revision: its daemon has just begun."""
@@ -28,7 +28,15 @@ IN_FORCE_S = 10.0
 """How long a change that is agreed is waited for at the node that was asked."""
 OVERTAKEN_S = 5.0
 """For this long a document is asked for while the fleet changes its electors by itself."""
-CODES = {"invalid": EXIT_FAILED, "conflict": EXIT_FAILED, "no_quorum": EXIT_DEGRADED, "unknown": EXIT_TIMED_OUT}
+CODES = {
+    "ok": EXIT_OK,
+    "unchanged": EXIT_OK,
+    "conflict": EXIT_FAILED,
+    "no_quorum": EXIT_DEGRADED,
+    "invalid": EXIT_FAILED,
+    "unknown": EXIT_TIMED_OUT,
+}
+"""{what has become of an order: exit code}."""
 TELL_S = 1.0
 """After this time it says what it waits for."""
 ADVICE = {
@@ -140,11 +148,14 @@ def change(door: Door, what: Json) -> Json:
     outcome, detail = str(answer["outcome"]), str(answer["detail"])
     if outcome in ("ok", "unchanged"):
         return answer
-    advice = ADVICE.get(outcome, "")
-    word = "" if outcome == "no_quorum" else f"{outcome}: "
-    words = f"{word}{detail}{'; ' if advice else ''}{advice}"
     kind = ConflictError if outcome == "conflict" else CliError
-    raise kind(CODES.get(outcome, EXIT_FAILED), words)
+    raise kind(CODES.get(outcome, EXIT_FAILED), told_refusal(outcome, detail, ADVICE))
+
+
+def told_refusal(outcome: str, detail: str, advice: Mapping[str, str]) -> str:
+    """Why an order did not come about; a lack of votes is told by its detail alone: who did not answer."""
+    word = "" if outcome == "no_quorum" else f"{outcome}: "
+    return "; ".join(filter(None, (f"{word}{detail}", advice.get(outcome))))
 
 
 def change_over(door: Door, what: Json, held: InForce) -> Json:

@@ -12,9 +12,8 @@ from typing import Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, say
-from zsched.commands.document import status_of
+from zsched.commands.document import CODES, status_of
 from zsched.commands.orders import (
-    CODES,
     NOTHING,
     PAUSE_S,
     OrderView,

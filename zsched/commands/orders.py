@@ -16,27 +16,19 @@ from typing import Final
 
 from zsched.commands.ask import Door, operator_at
 from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
-from zsched.commands.document import ask_all
+from zsched.commands.document import CODES, ask_all, told_refusal
 from zsched.commands.page import span
 from zsched.core.values.model import MAX_FOR_S
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import MAX_ASKER, shown
-from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 PAUSE_S: Final = 0.2
 """Between two looks at what has become of an order."""
-CODES: Final = {
-    "ok": EXIT_OK,
-    "unchanged": EXIT_OK,
-    "conflict": EXIT_FAILED,
-    "no_quorum": EXIT_DEGRADED,
-    "invalid": EXIT_FAILED,
-    "unknown": EXIT_TIMED_OUT,
-}
 ADVICE: Final = {
-    "conflict": "; look at `zsched status`, then try again",
-    "no_quorum": "; nothing was changed, and `zsched status` tells why",
-    "unknown": "; it may or may not have been agreed: `zsched status` shows which",
+    "conflict": "look at `zsched status`, then try again",
+    "no_quorum": "nothing was changed, and `zsched status` tells why",
+    "unknown": "it may or may not have been agreed: `zsched status` shows which",
 }
 NOTHING: Final = "-"
 Row = tuple[str, str, str, str]
@@ -205,9 +197,7 @@ def show_rows(titles: Row, rows: Sequence[Row]) -> None:
 def refused(task: str, result: Json) -> CliError:
     """The error that tells of an order that was not agreed."""
     outcome, detail = str(result["outcome"]), str(result["detail"]).removeprefix(f"{task}: ")
-    word = "" if outcome == "no_quorum" else f"{outcome}: "  # that one is told by its detail: who did not answer
-    text = f"{task}: {word}{detail}{ADVICE.get(outcome, '')}"
-    return CliError(CODES.get(outcome, EXIT_FAILED), text)
+    return CliError(CODES.get(outcome, EXIT_FAILED), f"{task}: {told_refusal(outcome, detail, ADVICE)}")
 
 
 def tell_results(results: Mapping[str, Json]) -> int:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from zsched.commands.ask import ask_door
 from zsched.commands.common import CliError, print_json, say
+from zsched.commands.document import CODES
 from zsched.commands.logs import worker_node
-from zsched.commands.orders import CODES, OrderView, begin, check_said
+from zsched.commands.orders import OrderView, begin, check_said
 from zsched.exits import EXIT_FAILED
 
 SCHEMA = "zsched.restart/1"

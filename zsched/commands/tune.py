@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from zsched.commands.ask import ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
-from zsched.commands.document import status_of
-from zsched.commands.orders import CODES, OrderView, begin, check_name, check_said, tell_results
+from zsched.commands.document import CODES, status_of
+from zsched.commands.orders import OrderView, begin, check_name, check_said, tell_results
 from zsched.commands.weight_words import NAMES, shares
 from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, default_patience
