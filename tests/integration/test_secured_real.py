@@ -17,7 +17,7 @@ import zenoh
 
 from support.authorities import install, secured
 from zsched.adapters.host.operator_client import ask
-from zsched.commands.ask import Door, ask_door, close_sessions
+from zsched.commands.ask import Door, _client, _visit, ask_door
 from zsched.commands.orders import user_name
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role
@@ -144,7 +144,9 @@ def test_the_document_and_its_flags_are_changed_in_the_name_of_the_certificate(
         flags = [{**flag, "by": "bob@robot1", "reason": "a lie"} for flag in told["flags"]]
         request = {"verb": "change", "text": told["text"], "flags": flags, "reason": "nothing, by bob@robot1"}
         answer = ask_door(door, {**request, "by": "bob@robot1", "base_revision": told["revision"]})
-        close_sessions()
+        _client(endpoint).close()
+        _client.cache_clear()
+        _visit.cache_clear()
         assert answer["outcome"] == "ok", answer
         wanted = {drained: "ana.operator", closed: "ana.operator"}
         bed.wait(lambda: flags_at(bed, "robot2") == wanted, 60, "no flag in another's name")

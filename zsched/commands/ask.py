@@ -502,19 +502,7 @@ def _client(endpoint: str, cell: Cell | None = None) -> FleetClient:
     config = client_config(connect=(endpoint,), operator_json5=visit.text, connect_s=CONNECT_S)
     client = FleetClient(endpoint, config, visit.asker, visit.fleet, visit.seals)
     atexit.register(client.close)
-    _opened.append(client)
     return client
-
-
-_opened: list[FleetClient] = []
-
-
-def close_sessions() -> None:
-    """End the sessions to other machines; the next question opens another one, with the certificates of then."""
-    while _opened:
-        _opened.pop().close()
-    _client.cache_clear()
-    _visit.cache_clear()
 
 
 class _Visit(Struct, frozen=True, kw_only=True):
