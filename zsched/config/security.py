@@ -18,7 +18,7 @@ from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Security, Signatures
 from zsched.core.values.struct import replace
 
-TLS = "tls/"
+TLS = "tls"
 _A = {"node": "a node", "operator": "an operator", "guest": "a guest"}
 
 
@@ -119,12 +119,13 @@ def _check_endpoints(section: Section, given: Section, out: Collector) -> None:
         listen: Section | None = entry.value.get("listen") if entry.value is not None else None
         for kind in ("control", "data", "streams") if listen is not None else ():
             assert listen is not None
-            endpoint = listen.get(kind, "")
-            if endpoint and not endpoint.startswith(TLS):
-                protocol, _, address = endpoint.partition("/")
-                why = "zenoh cannot end a refused link of quic/" if protocol == "quic" else f"{protocol}/ is plain text"
+            listener = Endpoint.of(listen.get(kind, ""))
+            if listener.protocol not in ("", TLS):
+                why = f"{listener.protocol}/ is plain text"
+                if listener.protocol == "quic":
+                    why = "zenoh cannot end a refused link of quic/"
                 message = f"{why}, and the fleet is secured (line {given.place.line})"
-                out.error(listen.where(kind), message, f"{TLS}{address}")
+                out.error(listen.where(kind), message, str(replace(listener, protocol=TLS)))
         local: Section | None = entry.value.get("local") if entry.value is not None else None
         ends: tuple[Located[str], ...] = () if local is None else local.get("listen", ())
         for end in ends:

@@ -33,7 +33,7 @@ def read_site(section: Section, folder: Path, out: Collector) -> tuple[Cell, ...
         file = one.value.get("file", "")
         if file:
             warn_missing(folder / file, one.value.where("file"), out)
-        elif any(gateway.value.startswith(TLS) for gateway in gateways):
+        elif any(Endpoint.of(gateway.value).protocol == TLS for gateway in gateways):
             message = f"{name!r} is a secured fleet, and nothing says with which certificate it is asked"
             hint = "file: its fleet file, whose `security: {folder:}` holds a certificate of its authority"
             out.error(gateways[0].place, message, hint)
