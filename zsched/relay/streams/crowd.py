@@ -218,11 +218,11 @@ class Crowd:
 
     def _count_returned(self, links: list[LinkSocket], passed_s: float) -> None:
         """Nodes and their workers are peers, and receive nothing here."""
-        peers = {str(zid) for zid in self._session.info.peers_zid()}
         before = self._put_before
         for link in links:
             known, newest = self._heard.get(link.zid, (self._put_count, before))
             if link not in self._readers:
+                peers = {str(zid) for zid in self._session.info.peers_zid()}
                 self._note_missed(0 if link.zid in peers else self._put_count - known)
                 self._heard[link.zid] = (before, before)
             elif 0 < link.silent_s() < passed_s:  # 0: it is gone
