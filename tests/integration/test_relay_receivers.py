@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -13,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from support.readers import Reader
 from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
 from support.waiting import POLL_S, TooSlowError, between, until, within
 from zsched.core.values.fleet import Timing
@@ -37,27 +36,9 @@ PATIENT = Timing(zenoh_lease_s=20.0)
 """A frozen reader is not helped by the end of its lease."""
 
 
-class Reader:
-    """An application in a process of its own, which writes what it gets into a file."""
-
-    def __init__(self, rig: Rig, name: str, pause_s: float = 0.0) -> None:
-        config = client_config(connect=(rig.endpoint(ROBOT),), timing=PATIENT)
-        self._path = rig.folder / name
-        command = [sys.executable, "-c", READER, str(pause_s), config]
-        with self._path.open("w") as out:
-            self.process = subprocess.Popen(command, stdout=out)
-        until(self._lines, "the reader has subscribed")
-
-    def _lines(self) -> list[str]:
-        return self._path.read_text().splitlines()
-
-    @property
-    def numbers(self) -> list[int]:
-        return [int(line) for line in self._lines()[1:] if line.isdigit()]
-
-    def end(self) -> None:
-        self.process.kill()
-        self.process.wait(60)
+def reading(rig: Rig, name: str, pause_s: float = 0.0) -> Reader:
+    config = client_config(connect=(rig.endpoint(ROBOT),), timing=PATIENT)
+    return Reader(READER, rig.folder / name, str(pause_s), config)
 
 
 @pytest.fixture
@@ -104,7 +85,7 @@ def gets_all(got: Callable[[], int], sent: int) -> None:
 def test_a_slow_application_loses_only_its_own(rig: Rig, hz: float, size: int) -> None:
     """It takes 100 of 500 a second, through full buffers: the others get everything, at the full rate."""
     app = healthy(rig, StreamClass.RELIABLE, size)
-    other, slow = Reader(rig, "other"), Reader(rig, "slow", pause_s=5 / hz)
+    other, slow = reading(rig, "other"), reading(rig, "slow", pause_s=5 / hz)
     try:
         began = time.monotonic()
         thread = app.stream(hz)
@@ -125,7 +106,7 @@ def test_a_slow_application_loses_only_its_own(rig: Rig, hz: float, size: int) -
 def test_a_slow_application_gets_the_newest_of_class_latest_in_the_end(rig: Rig) -> None:
     """What it was left behind for is made up for once it has room: the others may get that sample twice."""
     app = healthy(rig, StreamClass.LATEST, 100_000)
-    slow = Reader(rig, "slow", pause_s=0.03)
+    slow = reading(rig, "slow", pause_s=0.03)
     try:
         thread = app.stream(200)
         began = time.monotonic()
@@ -144,7 +125,7 @@ def test_a_slow_application_gets_the_newest_of_class_latest_in_the_end(rig: Rig)
 def test_a_frozen_application_delays_no_other(rig: Rig, hz: float, size: int) -> None:
     """It takes nothing for four seconds and more: the others get everything, with a short pause at most."""
     app = healthy(rig, StreamClass.RELIABLE, size)
-    other, frozen = Reader(rig, "other"), Reader(rig, "frozen")
+    other, frozen = reading(rig, "other"), reading(rig, "frozen")
     try:
         thread = app.stream(hz)
         until(lambda: len(app.back) > 20 and len(frozen.numbers) > 20, "the stream")

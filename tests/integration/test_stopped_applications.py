@@ -6,8 +6,6 @@ Real relays and workers; the application that stops is a process with a plain ze
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,6 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from support.readers import Reader
 from support.relay_rig import FLEET, ROBOT, Application, Rig, slot
 from support.waiting import free_endpoint, until, within
 from zsched.adapters.relay.streams import RelayHandle
@@ -60,32 +59,11 @@ class Host(Rig):
         return client_config(connect=(self.side,), timing=MINUTE, connect_s=20.0)
 
 
-class Reader:
-    """A plain subscriber in a process of its own."""
-
-    def __init__(self, config: str, path: Path) -> None:
-        self._path = path
-        with path.open("w") as out:
-            command = [sys.executable, "-c", READER, config]
-            self.process = subprocess.Popen(command, stdout=out)
-        until(self._lines, "the reader has subscribed")
-
-    def _lines(self) -> list[str]:
-        return self._path.read_text().splitlines()
-
-    @property
-    def numbers(self) -> list[int]:
-        return [int(line) for line in self._lines()[1:] if line.isdigit()]
-
-    def stop_for(self, seconds: float) -> None:
-        self.process.send_signal(signal.SIGSTOP)
-        until_s = time.monotonic() + seconds
-        until(lambda: time.monotonic() > until_s, "the standstill", seconds + 5)
-        self.process.send_signal(signal.SIGCONT)
-
-    def end(self) -> None:
-        self.process.kill()
-        self.process.wait(60)
+def stop_for(reader: Reader, seconds: float) -> None:
+    reader.process.send_signal(signal.SIGSTOP)
+    until_s = time.monotonic() + seconds
+    until(lambda: time.monotonic() > until_s, "the standstill", seconds + 5)
+    reader.process.send_signal(signal.SIGCONT)
 
 
 class Timed(Application):
@@ -128,11 +106,11 @@ def test_one_that_stops_misses_nothing(host: Host, stop_s: float, size: int, *, 
     if is_alone:
         only_asks(app)
     flowing(host, app, size)
-    reader = Reader(host.application_config(), host.folder / "reader")
+    reader = Reader(READER, host.folder / "reader", host.application_config())
     try:
         thread = app.stream(HZ)
         until(lambda: len(reader.numbers) > 3 * HZ, "the stream")
-        reader.stop_for(stop_s)
+        stop_for(reader, stop_s)
         until(lambda: reader.numbers[-1] > app.sent - 20, "it has caught up")
         app.halt(thread)
         until(lambda: reader.numbers[-1] == app.sent - 1, "every answer")
@@ -149,12 +127,12 @@ def test_what_one_on_the_fleets_own_side_misses_is_counted(tmp_path: Path) -> No
         rig.start_worker("edge1")
         app = Application(rig.app)
         flowing(rig, app, 100)
-        reader = Reader(client_config(connect=(rig.endpoint(ROBOT),), timing=MINUTE), tmp_path / "reader")
+        reader = Reader(READER, tmp_path / "reader", client_config(connect=(rig.endpoint(ROBOT),), timing=MINUTE))
         try:
             thread = app.stream(HZ)
             for _ in range(TRIES):  # now and then zenoh reads first, and its link stays
                 until(lambda: reader.numbers[-1:] > [app.sent - 20], "it goes on")
-                reader.stop_for(3.0)
+                stop_for(reader, 3.0)
                 until(lambda: reader.numbers[-1] > app.sent - 20, "it goes on")
                 if app.sent - reader.numbers[0] - len(reader.numbers) > 2 * HZ:
                     break
