@@ -63,10 +63,10 @@ def other_relay(home: Path) -> None:
     """The older version's relay has other code, and knows a word that the newer version's daemon does not say."""
     with (home / "lib/site-packages/zsched/relay/process.py").open("a") as file:
         file.write("# Of the older version.\n")
-    path, exclusive = home / "lib/site-packages/zsched/core/values/plan.py", "    exclusive: bool = False\n"
+    path, newest = home / "lib/site-packages/zsched/core/values/plan.py", "    predecessors: tuple[Slot, ...] = ()\n"
     text = path.read_text()
-    assert exclusive in text
-    path.write_text(text.replace(exclusive, f"{exclusive}    urgency: int = 0\n", 1))
+    assert newest in text
+    path.write_text(text.replace(newest, f"{newest}    urgency: int = 0\n", 1))
 
 
 @pytest.fixture(scope="module")
