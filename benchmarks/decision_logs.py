@@ -5,7 +5,7 @@ Robots and edges on loopback, each edge with a share of the CPU of its own, and 
 by service with a learnt patience.
 Every 5 to 25 s something happens, at random: a busy process in an edge's share, a daemon that is killed or stopped and
 started again, one that stands still for seconds, or an operator's order by the real command (move, pin, pause, tune,
-weights, drain, and what ends them). Meanwhile every line of every node's decision log is copied before its
+drain, and what ends them). Meanwhile every line of every node's decision log is copied before its
 file is replaced. At the end ``zsched replay`` makes the judgements of each copy again, in a process of its own.
 
 The exit code is 1 when one judgement comes out differently, or when a log has fewer lines than were read.

@@ -83,7 +83,7 @@ class Desk:
         self._order_s, self._orders_of = timing.order_s, orders_of
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request of the socket (``status``, ``explain``, ``log``, ``weights``, ...).
+        """Answer one request of the socket (``status``, ``explain``, ``log``, ``move``, ...).
 
         With ``node``: what another node answers.
         """

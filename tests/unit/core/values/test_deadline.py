@@ -1,4 +1,4 @@
-"""Where a task's deadline counts: one rule for the fleet file, `tune` and `weights`."""
+"""Where a task's deadline counts: one rule for the fleet file and `tune`."""
 
 from __future__ import annotations
 
