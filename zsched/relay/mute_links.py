@@ -3,7 +3,7 @@
 Where the old link of a session ended behind the beginning of its new one, zenoh (1.10) may have lost what the other end
 has declared: the link stays, and nothing mends it but another one. Nobody dials a worker (docs/decisions/0036), and it
 dials again at once when its link ends. Nobody knows which link is whose worker's, so all quiet ones of that machine end
-but its relay's: an idle worker loses nothing by it.
+but its relay's: an idle worker loses nothing by it. One to which samples go is not mute.
 
 Knows: which machines' workers are missed, who is at the other end of each link. Does not know: streams, why one is
 missed. The times are those of the control network (`zsched.core.membership.relink`).
@@ -26,7 +26,7 @@ from zsched.sessions.link_sockets import LinkSocket, LinkSockets
 from zsched.wire.keyspace import Keyspace, parse
 
 QUIET_BYTES: Final = 200
-"""Between two looks, a second apart: signs of life, also within TLS, are fewer."""
+"""Each way between two looks, a second apart: signs of life, also within TLS, are fewer."""
 
 _log = logging.getLogger("zsched.relay")
 
@@ -36,7 +36,8 @@ class MuteLinks:
 
     def __init__(self, session: Session, keyspace: Keyspace) -> None:
         self._sockets, self._due = LinkSockets(session), Introductions()
-        self._brought: dict[LinkSocket, int] = {}
+        self._moved: dict[LinkSocket, tuple[int, int]] = {}
+        """{link: (bytes that it has brought, bytes that have gone by it)}."""
         self._relays: dict[str, NodeId] = {}
         """{session: whose relay's}."""
         note = tolerant(self._note, "relays")
@@ -53,14 +54,15 @@ class MuteLinks:
 
     def look(self, missed: AbstractSet[NodeId], now: float) -> None:
         """Once a second. ``missed``: the machines whose worker is not seen here."""
-        before, self._brought = self._brought, {}
+        before, self._moved = self._moved, {}
         try:
             for link in self._of_workers(missed) if missed else ():
-                self._brought[link] = link.brought()
+                self._moved[link] = (link.brought(), link.taken())
         except ZError:
             return  # the session closes
-        quiet = [link for link, at in self._brought.items() if at - before.get(link, -QUIET_BYTES) < QUIET_BYTES]
-        if self._due.is_due(now, is_missing=bool(quiet)):
+        known = ((link, moved, before[link]) for link, moved in self._moved.items() if link in before)
+        quiet = [link for link, at, was in known if max(at[0] - was[0], at[1] - was[1]) < QUIET_BYTES]
+        if (quiet or not missed) and self._due.is_due(now, is_missing=bool(missed)):  # pauses grow with each end only
             for link in quiet:
                 if link.cut():
                     _log.warning("%s brings nothing, and a worker there is missed: its link is ended", link.name)
