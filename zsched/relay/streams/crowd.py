@@ -10,7 +10,8 @@ none is *left behind*, while another one is ready, when it has taken nothing for
 waited this long for it and the queue before the put runs full. As long as somebody is left behind, puts do not wait
 (DROP): zenoh drops for this receiver alone. What it may have missed is counted. After a rest, and when its link has
 room again, it is waited for like the others; of class ``latest`` the newest sample is then put once more. While nobody
-has room nothing is put: a put that waits is not to be taken back, and zenoh ends the link that it waits for.
+has room nothing is put, until the queue is full: a put that waits is not to be taken back, and zenoh ends the link that
+it waits for.
 
 A link that ends takes along what its sockets held. When its client dials again, what was put since it was last heard
 counts as missed: what it had read of that nobody knows.
@@ -43,7 +44,9 @@ FORGIVEN_RATIO: Final = 0.5
 REST_S, MAX_REST_S = 1.0, 8.0
 """A receiver is left behind for at least this long; for twice as long when it is left again soon."""
 TOLD_BYTES: Final = 192 << 10
-"""After so much a link that was sent less than half of it leads to nobody who receives the stream."""
+"""After so much a link that was sent next to nothing of it leads to nobody who receives the stream..."""
+MIN_SHARE: Final = 32
+"""...less than the 32nd part: a receiver may take some of a stream's keys only."""
 SLOW_PUT_S: Final = 0.005
 MAX_CHARGE_S: Final = 0.5
 
@@ -72,7 +75,7 @@ class Reader(Struct, eq=False):
     rest_s: float = 0.0
     back_at: float = 0.0
     receives: bool = True
-    """Not, while its link is sent less than is put..."""
+    """Not, while its link is sent next to nothing of what is put..."""
     sent: tuple[int, int] = (0, 0)
     """...since (bytes put, bytes sent by its link)."""
 
@@ -81,7 +84,7 @@ class Reader(Struct, eq=False):
         told = self.link.account()
         if told is not None and not self.is_full and put - self.sent[0] >= TOLD_BYTES:
             before, self.sent = self.sent, (put, told.acked + told.held)
-            self.receives = 2 * (self.sent[1] - before[1]) >= put - before[0]
+            self.receives = MIN_SHARE * (self.sent[1] - before[1]) >= put - before[0]
 
     def look(self, now: float, *, has_room: bool) -> None:
         """Note whether it takes anything, and what that costs the others."""
@@ -109,11 +112,22 @@ class Reader(Struct, eq=False):
 class Crowd:
     """The applications that receive one output stream. `put` and `take_owed` belong to one thread, the rest to any."""
 
-    def __init__(self, session: Session, expr: str, is_pressed: Callable[[], bool], *, is_latest: bool) -> None:
-        """``is_pressed`` says whether samples wait before `put`, so many that some will be dropped for all."""
+    def __init__(
+        self,
+        session: Session,
+        expr: str,
+        is_pressed: Callable[[], bool],
+        may_wait: Callable[[int], bool],
+        *,
+        is_latest: bool,
+    ) -> None:
+        """``is_pressed`` says whether samples wait before `put`, so many that some will be dropped for all.
+
+        ``may_wait``: whether a sample of this size could wait there, too; if not, the next one is dropped for all.
+        """
         self._session = session
         self._expr = expr
-        self._is_pressed = is_pressed
+        self._is_pressed, self._may_wait = is_pressed, may_wait
         self._is_latest = is_latest
         self._sockets = LinkSockets(session)
         self._readers: dict[LinkSocket, Reader] = {}
@@ -134,7 +148,7 @@ class Crowd:
 
     def put(self, lane: Lane, sample: Sample, stamp: Timestamp | None, size: int) -> None:
         """Put a sample, waiting for every receiver that is not left behind."""
-        left = self._wait()
+        left = self._wait(size)
         self._put_count, self._put_bytes = self._put_count + 1, self._put_bytes + size
         self._putting_since = monotonic_s()
         try:
@@ -230,8 +244,11 @@ class Crowd:
         while len(self._heard) > MAX_KNOWN:
             self._heard.pop(next(iter(self._heard)))
 
-    def _wait(self) -> tuple[Reader, ...]:
-        """Wait for room at every link; returns the receivers that are left behind and have none."""
+    def _wait(self, size: int) -> tuple[Reader, ...]:
+        """Wait for room at every link; returns the receivers that are left behind and have none.
+
+        Before a sample would be dropped for all, one is dropped for those that have no room.
+        """
         looked_at = monotonic_s()
         while True:
             self._look(monotonic_s())
@@ -240,7 +257,8 @@ class Crowd:
             self._charge(full, now - looked_at)
             looked_at = now
             waiting = [reader for reader in full if reader.left_until is None]
-            if not waiting or self._is_closed:
+            has_other = len(full) < len(self._readers)
+            if not waiting or self._is_closed or (has_other and not self._may_wait(size)):
                 return tuple(full)
             _ready(waiting, SLICE_S)
 

@@ -153,7 +153,7 @@ class Outlet:
         if (queue := self._queue) is None:
             return None  # class `best_effort` waits for nobody
         is_latest = self._settings.stream_class is StreamClass.LATEST
-        return Crowd(self._session, self._to, lambda: queue.is_pressed, is_latest=is_latest)
+        return Crowd(self._session, self._to, lambda: queue.is_pressed, queue.has_room, is_latest=is_latest)
 
     def _make_queue(self, *, waits_long: bool) -> SendQueue | None:
         stream_class, depth = self._settings.stream_class, self._settings.depth

@@ -22,6 +22,7 @@ from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outlet import Outlet
 from zsched.sessions.config import client_config, data_config
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets
+from zsched.sessions.send_queue import NO_ROOM_S
 
 NOW = 100.0
 
@@ -106,6 +107,47 @@ def test_a_reader_moves_as_long_as_it_takes_something(pair: Pair) -> None:
     assert reader.moved_at == NOW + 5
 
 
+@pytest.mark.parametrize(("share", "receives"), [(2.5, True), (20, True), (100, False)])
+def test_one_that_takes_some_of_the_keys_receives_the_stream(pair: Pair, share: float, *, receives: bool) -> None:
+    """The link of one who only publishes carries next to nothing."""
+    reader, ours, _ = pair
+    reader.compare(crowd.TOLD_BYTES)  # what its link carried before
+    reader.receives = not receives
+    ours.sendall(bytes(int(crowd.TOLD_BYTES / share)))
+    reader.compare(2 * crowd.TOLD_BYTES)
+    assert reader.receives is receives
+
+
+def fill(ours: socket.socket) -> None:
+    """Until nothing fits any more, also after the kernel has moved what fits at the other end."""
+    ours.setblocking(False)
+    while crowd._ready([Reader(link_of(ours), NOW)], 0.2):
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                ours.send(bytes(1 << 20))
+
+
+def test_a_full_queue_waits_no_longer_for_a_frozen_one_while_somebody_has_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever takes next to nothing of the stream counts as nobody, and hears it all the same."""
+    monkeypatch.setattr(Crowd, "_look", lambda *_args, **_named: False)
+    has_queue_room, left = [True], list[tuple[Reader, ...]]()
+    with hub_and_neighbour() as (session, _), connection() as (stuck, _), connection() as (free, _):
+        fill(stuck)
+        frozen, little = Reader(link_of(stuck), NOW), Reader(link_of(free), NOW, receives=False)
+        made = Crowd(session, "out", lambda: True, lambda _: has_queue_room[0], is_latest=False)
+        made._readers = {one.link: one for one in (frozen, little)}
+        thread = threading.Thread(target=lambda: left.append(made._wait(1)))
+        thread.start()
+        try:
+            thread.join(4 * NO_ROOM_S)
+            assert thread.is_alive(), "the queue holds what it does not take"
+            has_queue_room[0] = False
+            until(lambda: left == [(frozen,)], "a put")
+        finally:
+            made.close()
+            thread.join(10)
+
+
 def test_half_of_the_time_is_forgiven(pair: Pair) -> None:
     reader, _, _ = pair
     reader.cost_s = 1.0
@@ -140,7 +182,7 @@ def test_the_sockets_of_all_links_are_found_and_workers_receive_no_outputs() -> 
         hub, *apps = [stack.enter_context(zenoh.open(zenoh.Config.from_json5(text))) for text in texts]
         sockets = LinkSockets(hub)
         until(lambda: len(sockets.links()) == 3, "the links")
-        made = crowd.Crowd(hub, "out", lambda: False, is_latest=False)
+        made = crowd.Crowd(hub, "out", lambda: False, lambda _: True, is_latest=False)
         note_feeder(str(apps[2].zid()))
         made._look(NOW)
         links = list(made._readers)
@@ -153,9 +195,9 @@ def test_what_readers_have_missed_is_told_once_also_to_one_who_asks_meanwhile(mo
     told: list[int] = []
 
     monkeypatch.setattr(Crowd, "_look", lambda *_args, **_named: False)
-    monkeypatch.setattr(Crowd, "_wait", lambda _: (None, None))
+    monkeypatch.setattr(Crowd, "_wait", lambda *_: (None, None))
     with hub_and_neighbour() as (session, _):
-        made = Crowd(session, "out", lambda: False, is_latest=False)
+        made = Crowd(session, "out", lambda: False, lambda _: True, is_latest=False)
         lane = SimpleNamespace(put_dropping=lambda *_: told.append(made.take_missed()))
         for _ in range(3):
             made.put(cast("Lane", lane), cast("zenoh.Sample", None), None, 1)
@@ -177,7 +219,7 @@ def test_what_a_reader_has_missed_comes_again_and_never_behind_a_newer_sample(
 
     monkeypatch.setattr(Lane, "put", slow)
     monkeypatch.setattr(Crowd, "_look", lambda *_args, **_named: False)
-    monkeypatch.setattr(Crowd, "_wait", lambda _: tuple(left))
+    monkeypatch.setattr(Crowd, "_wait", lambda *_: tuple(left))
     settings = StreamSettings(stream_class=StreamClass.LATEST, keep_last=1)
     with hub_and_neighbour() as (relay, outside):
         kept = outside.declare_subscriber("out", lambda sample: got.append(sample.payload.to_string()))
