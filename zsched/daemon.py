@@ -416,6 +416,7 @@ class Daemon:
             events=shell.crew,
             environment=recipes.environment,
             session=recipes.session,
+            starter=recipes.starter,
             rng=random.Random(f"{me}/{incarnation}/workers"),
             why_not_ready=shell.crew.why_not_ready,
         )

@@ -218,7 +218,9 @@ def furnish(root: Path, home: Path, version: str, when: int) -> None:
     """Put units, the user, completion, manual pages and documents where Debian has them."""
     share, commands = home / "share", home / "lib/site-packages/zsched/commands/completions"
     copies = {
-        "usr/lib/systemd/system": [*share.glob("zsched/*.service"), *share.glob("zsched/*.timer")],
+        "usr/lib/systemd/system": [
+            file for kind in ("service", "socket", "timer") for file in share.glob(f"zsched/*.{kind}")
+        ],
         "usr/lib/systemd/system/zsched.service.d": [share / "zsched/zsched.service.d/10-user.conf"],
         "usr/lib/systemd/system/zsched-web.service.d": [share / "zsched/zsched-web.service.d/10-user.conf"],
         "usr/share/bash-completion/completions": [commands / "zsched"],

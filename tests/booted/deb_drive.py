@@ -71,7 +71,9 @@ def take_away() -> dict[str, Any]:
 
 def purge() -> dict[str, Any]:
     """With pip as docs/guide/install.md says."""
-    by_hand = f"rm -r /etc/zsched /var/lib/zsched {HOME}; userdel zsched"
+    by_hand = (
+        f"rm -rf /etc/zsched /var/lib/zsched /var/lib/zsched-workers {HOME}; userdel zsched; userdel zsched-worker"
+    )
     return said("sh", "-ec", by_hand) if BY_PIP else dpkg("-P", "zsched")
 
 

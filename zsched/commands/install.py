@@ -26,13 +26,21 @@ from zsched.installer import is_debian_package
 from zsched.paths import authority_folders, is_there
 from zsched.runtime.membership import whose
 
-UNITS: Final = ("zsched.service", "zsched-web.service", "zsched-renew.service", "zsched-renew.timer")
+UNITS: Final = (
+    "zsched.service",
+    "zsched-web.service",
+    "zsched-renew.service",
+    "zsched-renew.timer",
+    "zsched-worker@.service",
+    "zsched-worker@.socket",
+)
 DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-user.conf")
 MOST_LINKS: Final = 40
 """As the kernel follows."""
 OPT: Final = "/opt/zsched"
 """The installation that the units as shipped are for."""
-USER: Final = "zsched"
+USERS: Final = ("zsched", "zsched-worker")
+"""The daemon's, and its workers'."""
 MANUAL: Final = "man/man1"
 OLD_PAGE: Final = "manual page of a verb that this version has not"
 HIDDEN: Final = ("/home", "/root", "/tmp", "/var/tmp", "/run/user")  # noqa: S108 - what the unit hides from the service
@@ -111,12 +119,12 @@ def install(root: Path, *, is_plan: bool) -> int:
         )
     missing = [piece for piece in pieces if not piece.is_there()]
     old = _old_pages(prefix, root, pieces)
-    needs_user = _is_this_machine(root) and not _has_user()
+    needs_users = _is_this_machine(root) and not _has_users(*USERS)
     if is_plan:
         _tell("would make ", ((piece.path, piece.what) for piece in missing))
         _tell("would remove ", ((path, OLD_PAGE) for path in old))
-        _print([f"would make the user and group {USER}"] if needs_user else [])
-        return EXIT_WOULD_CHANGE if missing or old or needs_user else EXIT_OK
+        _print([f"would make the users {', '.join(USERS)}"] if needs_users else [])
+        return EXIT_WOULD_CHANGE if missing or old or needs_users else EXIT_OK
     _need_rights(root)
     for piece in missing:
         _carefully(piece.path, piece.make)
@@ -124,11 +132,11 @@ def install(root: Path, *, is_plan: bool) -> int:
         _carefully(path, path.unlink)
     _tell("", ((piece.path, piece.what) for piece in missing))
     _tell("removed ", ((path, OLD_PAGE) for path in old))
-    if needs_user:
+    if needs_users:
         _make_user(root)
-        _print([f"user and group {USER}: the daemon's; members of the group may ask it and give orders"])
+        _print([f"users {', '.join(USERS)}: members of the group {USERS[0]} may ask the daemon and give orders"])
     _reload(root)
-    if not missing and not old and not needs_user:
+    if not missing and not old and not needs_users:
         _print(["everything is there already"])
     _print([f"next: {_next(root)}"])
     return EXIT_OK
@@ -147,7 +155,7 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     ours = [piece for piece in pieces if piece.is_ours()]
     stays = [f"{piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way()]
     stays += [f"{path}: a drop-in that zsched has not made" for path in _other_drop_ins(root, pieces)]
-    kept = [Path("/etc/zsched"), Path("/var/lib/zsched"), prefix]
+    kept = [Path("/etc/zsched"), Path("/var/lib/zsched"), Path("/var/lib/zsched-workers"), prefix]
     if is_plan:
         _print(_still_a_node(root / "var/lib/zsched", is_gone=False))
         _print(["would stop and disable the services"] if any(one.path.name in UNITS for one in ours) else [])
@@ -160,7 +168,8 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     if _has_systemd(root):
         found = [piece.path.name for piece in ours if piece.path.name in UNITS]
         if found:
-            _tool("systemctl", "disable", "--now", "--quiet", *found)
+            _tool("systemctl", "disable", "--quiet", *found)
+            _tool("systemctl", "stop", *(name.replace("@", "@*") for name in found))
     for piece in ours:
         _carefully(piece.path, piece.path.unlink)
     _tell("removed ", ((piece.path, piece.what) for piece in ours))
@@ -195,7 +204,11 @@ def _other_drop_ins(root: Path, pieces: Iterable[Piece]) -> list[Path]:
 def left(folders: Iterable[Path], env: Mapping[str, str]) -> list[str]:
     """What an uninstallation leaves behind, of these folders and of this user's authorities, as it is told."""
     kept = ", ".join([str(path) for path in folders if path.exists()])
-    said = [f"what is left: {kept}, and the user {USER}; docs/guide/install.md says how it goes, too"] if kept else []
+    said = (
+        [f"what is left: {kept}, and the users {', '.join(USERS)}; docs/guide/install.md says how it goes, too"]
+        if kept
+        else []
+    )
     return said + [
         f"what is left: {folder}, the authority of fleet {folder.name}; without its key nobody joins that fleet, and "
         f"no certificate is renewed, so keep it as long as that fleet runs. {TIMER}, which renews them from here, goes "
@@ -243,7 +256,7 @@ def _pieces(prefix: Path, root: Path) -> Iterator[Piece]:
         text = _read(share / "zsched" / unit).replace(OPT, str(prefix))
         yield Piece(path=root / "etc/systemd/system" / unit, what=f"unit of {prefix}", text=text)
     users = _read(share / "zsched/zsched.sysusers")
-    yield Piece(path=root / "etc/sysusers.d/zsched.conf", what=f"the user and group {USER}", text=users)
+    yield Piece(path=root / "etc/sysusers.d/zsched.conf", what="the users of daemon and workers", text=users)
     yield Piece(path=root / "usr/local/bin/zsched", what="the program", target=prefix / "bin/zsched")
     for shell, folder in COMPLETIONS.items():
         path = root / folder / SCRIPTS[shell]
@@ -284,21 +297,19 @@ def _need_rights(root: Path) -> None:
         raise CliError(EXIT_FAILED, "this writes to /etc and /usr/local; run it by sudo (--plan shows what it does)")
 
 
-def _has_user() -> bool:
+def _has_users(*names: str) -> bool:
     import pwd  # noqa: PLC0415 - the only use
 
-    try:
-        pwd.getpwnam(USER)
-    except KeyError:
-        return False
-    return True
+    return {*names} <= {user.pw_name for user in pwd.getpwall()}
 
 
 def _make_user(root: Path) -> None:
     if shutil.which("systemd-sysusers"):
         _tool("systemd-sysusers", str(root / "etc/sysusers.d/zsched.conf"))
         return
-    _tool("useradd", "--system", "--user-group", "--no-create-home", "--home-dir=/nonexistent", USER)
+    for user in USERS:
+        if not _has_users(user):
+            _tool("useradd", "--system", "--user-group", "--no-create-home", "--home-dir=/nonexistent", user)
 
 
 def _reload(root: Path) -> None:

@@ -522,7 +522,7 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
         yield _set(AT_ONCE, f"{path}.scheduling.patience", patience, other)
 
 
-_OF_A_PROCESS: Final = ("command", "env", "link")
+_OF_A_PROCESS: Final = ("command", "env", "link", "user")
 """What a worker's process keeps until it ends."""
 
 

@@ -32,6 +32,9 @@ class ContainerEngine(StrEnum):
     DOCKER = "docker"
 
 
+AS_THE_DAEMON: Final = (Driver.SYSTEMD, Driver.CONTAINER)
+"""What keeps the worker of these is a program of ours, which needs the daemon's rights towards its engine."""
+
 _UNIT: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9:_.\\-]{0,200}(@[A-Za-z0-9:_.\\-]*)?\.service")
 _OWN: Final[Mapping[Driver, tuple[str, ...]]] = {
     Driver.PROCESS: ("command",),
@@ -128,6 +131,10 @@ def command_of(section: Section, out: Collector) -> tuple[str, ...] | None:
                 return None
     if driver is Driver.PROCESS:
         return None
+    if driver in AS_THE_DAEMON and "user" in section.places:
+        hint = "the unit has a `User=`" if driver is Driver.SYSTEMD else "`options: [--user=NAME]` says it"
+        out.error(section.where("user"), f"driver {driver} has no 'user'", hint)
+        return None
     for needed in _OWN[driver] if driver is Driver.ROS2_LIFECYCLE else _OWN[driver][:1]:
         if needed not in section.places:
             out.error(section.where("driver"), f"driver {driver} needs the key {needed!r}", f"{needed}: ...")
@@ -138,8 +145,17 @@ def command_of(section: Section, out: Collector) -> tuple[str, ...] | None:
         message = "a ROS 2 node shows no token of zsched.worker: it is ready when it subscribes"
         out.error(section.where("driver"), message, "ready: matching")
         return None
-    program = ("python", "-m", f"zsched.drivers.{driver}")
-    return (*program, *_WORDS[driver](section), *(word for name in section.get("env", {}) for word in ("--env", name)))
+    names = (word for name in section.get("env", {}) for word in ("--env", name))
+    return (*_program(driver), *_WORDS[driver](section), *names)
+
+
+def runs_as_the_daemon(command: tuple[str, ...]) -> bool:
+    """Whether a worker's command is a driver that needs the daemon's rights."""
+    return command[:3] in [_program(driver) for driver in AS_THE_DAEMON]
+
+
+def _program(driver: Driver) -> tuple[str, ...]:
+    return ("python", "-m", f"zsched.drivers.{driver}")
 
 
 def _systemd_words(section: Section) -> tuple[str, ...]:

@@ -69,6 +69,7 @@ PKI_FOLDER: Final = "pki"
 _HOST: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?:\.(?!-)[A-Za-z0-9_-]{1,63})*\.?")
 _MAC: Final = re.compile(r"[0-9a-fA-F]{2}(:[0-9a-fA-F]{2}){5}")
 _ENV_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,31}")
 _INTERFACE: Final = re.compile(r"[^\s/]{1,15}")
 
 
@@ -323,6 +324,7 @@ WORKER: Final = Record(
             WorkerSpec,
             command=ListOf(Text("a word", _text_fault), least=1),
             env=MapOf(Text("a variable", _matches(_ENV_NAME, "letters, digits and '_'")), _TEXT),
+            user=Text("a user of the machine", _matches(_USER, "lower-case letters, digits, '-' and '_'")),
         ),
     },
 )

@@ -125,6 +125,9 @@ def check_secured(section: Section, out: Collector) -> None:
         if worker is not None and worker.get("driver") is Driver.ROS2_LIFECYCLE:
             message = "a secured fleet lets nobody lead a managed node: its services are no streams of the fleet"
             out.error(worker.where("driver"), message, "start the node by `command:` alone, and leave `driver:` out")
+        if worker is not None and worker.get("user"):
+            message = "a worker of a secured fleet joins by its node's key, which only the daemon's user may read"
+            out.error(worker.where("user"), message, "leave `user:` out")
 
 
 def _of(section: Section, *names: str) -> dict[str, Any]:

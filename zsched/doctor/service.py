@@ -16,9 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from zsched.core.values.fleet import runs_worker
+from zsched.adapters.workers.hired import FOLDER
+from zsched.core.values.fleet import WorkerSpec, runs_worker
 from zsched.core.values.struct import Struct
 from zsched.doctor.model import Result, Scene, failed, joined, passed, skipped, warned
+from zsched.runtime.recipes import starter_for
 from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
 
 UNIT: Final = "zsched.service"
@@ -157,6 +159,14 @@ def user_of_service(scene: Scene) -> tuple[int, int] | None:
     if reader.uid == 0:
         return None
     return (reader.uid, reader.group) if reader.uid > 0 else (NOBODY, NOBODY)
+
+
+def starter_of_service(scene: Scene, worker: WorkerSpec) -> Path | None:
+    """The socket of who starts a worker for the service, as another user; ``None``: the daemon starts it."""
+    unit = _unit(scene)
+    said = [] if unit is None else [value for name, value in _settings(scene, unit) if name == "Environment"]
+    env = dict(word.partition("=")[::2] for value in said for word in value.split())
+    return starter_for(worker, scene.fleet, {FOLDER: str(scene.at(env[FOLDER]))} if FOLDER in env else {})
 
 
 def path_of_service(scene: Scene) -> str | None:

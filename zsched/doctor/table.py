@@ -99,6 +99,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     ),
     Check(name="tls.open", asks="Is it closed to the internet, or secured?", run=security.is_not_open_to_everybody),
     Check(name="worker.command", asks="Are its workers' programs there?", run=workers.commands_are_there),
+    Check(name="worker.user", asks="Can they be started as their users?", run=workers.users_are_there),
     Check(name="worker.imports", asks="Do they find what they import?", run=workers.packages_are_there),
     Check(name="worker.engine", asks="Is what their drivers keep there?", run=workers.engines_are_there),
     Check(name="worker.state", asks="Are its workers well?", run=workers.run_well, needs=Needs.STATUS),

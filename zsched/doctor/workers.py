@@ -5,8 +5,10 @@ Knows: commands, programs, modules that cannot be imported. Does not know: what 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import pwd
 import shutil
 import subprocess
 import sys
@@ -17,7 +19,7 @@ from typing import Any, Final
 from zsched.core.values.fleet import TaskSpec, runs_worker
 from zsched.core.values.words import RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
-from zsched.doctor.service import path_of_service, user_of_service
+from zsched.doctor.service import path_of_service, starter_of_service, user_of_service
 from zsched.drivers import container, ros2_lifecycle, systemd
 from zsched.drivers.engine import Look
 from zsched.installer import is_debian_package
@@ -73,11 +75,35 @@ def _is_python(program: str) -> bool:
     return Path(program).name.rstrip("0123456789.") == "python"
 
 
+def users_are_there(scene: Scene) -> Result:
+    """Whether each worker can be started as its user."""
+    return joined([_user(scene, task) for task in _mine(scene)], skipped("no worker is started by the daemon here"))
+
+
+def _user(scene: Scene, task: TaskSpec) -> Result:
+    starter = starter_of_service(scene, task.worker)
+    if starter is None:
+        return passed(f"{task.name}: runs as the daemon's user")
+    if starter.exists():
+        return passed(f"{task.name}: runs as {starter.stem}")
+    fix = f"sudo systemctl enable --now zsched-worker@{starter.stem}.socket"
+    return failed(f"{task.name}: nobody starts workers as user {starter.stem} here", fix=fix)
+
+
 def packages_are_there(scene: Scene) -> Result:
     """Whether each worker in Python finds the packages that it imports."""
-    user = user_of_service(scene) if os.geteuid() == 0 else None
-    found = [result for task in _mine(scene) if (result := _packages(task, user)) is not None]
+    service, is_root = user_of_service(scene), os.geteuid() == 0
+    users = {task.name: _ids(starter_of_service(scene, task.worker), service) for task in _mine(scene) if is_root}
+    found = [result for task in _mine(scene) if (result := _packages(task, users.get(task.name))) is not None]
     return joined(found, skipped("no worker in Python is started by the daemon here"))
+
+
+def _ids(starter: Path | None, service: tuple[int, int] | None) -> tuple[int, int] | None:
+    """(user id, group id) of the user whom a starter starts workers as; without one those of the ``service``."""
+    with contextlib.suppress(KeyError):
+        user = None if starter is None else pwd.getpwnam(starter.stem)
+        return service if user is None else (user.pw_uid, user.pw_gid)
+    return service
 
 
 def _packages(task: TaskSpec, user: tuple[int, int] | None) -> Result | None:

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from zsched.adapters.workers.hired import starter_of
+from zsched.config.drivers import runs_as_the_daemon
 from zsched.core.route.route import outputs_of
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerLink, WorkerSpec, runs_worker
 from zsched.core.values.model import NodeId, TaskId
@@ -31,6 +34,7 @@ class _Made(Struct, frozen=True, kw_only=True):
     specs: Mapping[TaskId, WorkerSpec]
     sessions: Mapping[TaskId, str]
     environments: Mapping[TaskId, Mapping[str, str]]
+    starters: Mapping[TaskId, Path | None]
 
 
 class Recipes:
@@ -53,7 +57,7 @@ class Recipes:
         """
         self._me, self._folder, self.read = me, folder, read
         self._shared_memory, self._operator_json5, self._pools = shared_memory, operator_json5, pools
-        self._made = _Made(specs={}, sessions={}, environments={})
+        self._made = _Made(specs={}, sessions={}, environments={}, starters={})
         self._written: dict[TaskId, str] = {}
         """{task: the session in its file}, of another fleet than the recipes where one could not be written."""
 
@@ -74,6 +78,10 @@ class Recipes:
     def session(self, task: TaskId) -> str:
         """The text of the session that a task's worker opens."""
         return self._made.sessions.get(task, "")
+
+    def starter(self, task: TaskId) -> Path | None:
+        """Who starts a task's worker, as another user; ``None``: the daemon."""
+        return self._made.starters.get(task)
 
     def adopt(self, fleet: Fleet, connect: tuple[str, ...], *, dials_by_gossip: bool) -> None:
         """Make the recipes of a fleet file, and write the session files that have changed.
@@ -115,6 +123,7 @@ class Recipes:
             specs={task.name: task.worker_on(self._me) for task in mine},
             sessions=sessions,
             environments={task.name: self._environment(task, pools) for task in mine},
+            starters={task.name: starter_for(task.worker, fleet) for task in mine},
         )
 
     def close(self) -> None:
@@ -156,3 +165,10 @@ class Recipes:
         if keys := outputs_of(task, self._me):
             made |= {"ZSCHED_OUTPUT_KEYS": json.dumps(keys)}
         return made
+
+
+def starter_for(worker: WorkerSpec, fleet: Fleet, env: Mapping[str, str] = os.environ) -> Path | None:
+    """Who starts a worker, as another user; a secured fleet's joins by the node's key, which only the daemon reads."""
+    if runs_as_the_daemon(worker.command) or (fleet.security is not None and not worker.user):
+        return None
+    return starter_of(worker.user, env)

@@ -57,7 +57,9 @@ def test_install_lays_out_what_the_system_looks_for(prefix: Path, root: Path) ->
     ):
         assert (root / "usr/local/share" / name).is_file()
     assert (root / "usr/local/share/man/man1/zsched-install.1").is_file()
-    assert (root / "etc/sysusers.d/zsched.conf").read_text().splitlines()[-1].startswith("u zsched ")
+    users = (root / "etc/sysusers.d/zsched.conf").read_text().splitlines()
+    assert [line.split()[1] for line in users if line.startswith("u ")] == ["zsched", "zsched-worker"]
+    assert f"ExecStart={prefix}/bin/python" in (root / "etc/systemd/system/zsched-worker@.service").read_text()
     for name in files_in(root):
         assert str((root / name).parent) in result.output, "every folder is said"
 
@@ -94,7 +96,7 @@ def test_a_plan_lists_what_stays_too(prefix: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr("zsched.commands.install.HIDDEN", ())
     said = run("uninstall", Path("/"), "--plan").output
-    assert f"{prefix}, and the user zsched" in said
+    assert f"{prefix}, and the users zsched, zsched-worker;" in said
     assert f"what is left: {authority}, the authority of fleet field" in said
 
 

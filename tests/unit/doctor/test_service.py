@@ -313,3 +313,17 @@ def test_a_session_without_certificates_at_a_public_address_is_found(tmp_path: P
 def test_a_zenoh_file_that_cannot_be_read_is_found(secured: Scene, tmp_path: Path) -> None:
     (tmp_path / "zenoh.json5").write_text(json.dumps({"nosuch": 1}))
     assert_finds(run("tls.open", secured), FAIL, "not a zenoh configuration")
+
+
+def test_workers_whom_nobody_starts_as_their_user_are_found(scene: Scene, tmp_path: Path) -> None:
+    unit = scene.root / "etc/systemd/system/zsched.service"
+    assert run("worker.user", scene).evidence == ("merge: runs as the daemon's user",)
+    unit.write_text(unit.read_text() + "\n[Service]\nEnvironment=ZSCHED_STARTERS=/run/zsched-workers\n")
+    folder = scene.root / "run/zsched-workers"
+    folder.mkdir()
+    (folder / "zsched-worker.sock").touch()
+    assert run("worker.user", scene).evidence == ("merge: runs as zsched-worker",)
+    named = scene_of(tmp_path, FLEET.replace("worker: {", "worker: {user: ros, "))
+    found = run("worker.user", replace(named, root=scene.root))
+    assert_finds(found, FAIL, "nobody starts workers as user ros here")
+    assert found.fix == "sudo systemctl enable --now zsched-worker@ros.socket"

@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 from zsched import log_limit
+from zsched.adapters.workers.hired import Hired
 from zsched.adapters.workers.kept_lines import KeptLines
 from zsched.clock import awake_s
 from zsched.screen import harmless
@@ -129,6 +130,41 @@ class LineLog:
             self._suppressed = 0
 
 
+class _Own:
+    """A process that the daemon has started itself, as its own user."""
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", LAUNCHER, str(os.getpid()), *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=dict(environment),
+            start_new_session=True,
+        )
+        self.pid = self.group = self._process.pid
+        assert self._process.stdout is not None
+        self._output = self._process.stdout
+        self.output_fd = self._output.fileno()
+        self.end_fd = _open_pid_fd(self.pid)
+        self.wait = self._process.wait
+
+    def has_exited(self) -> bool:
+        try:
+            return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        except ChildProcessError:
+            return True
+
+    def signal_group(self, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, number)
+
+    def close(self) -> None:
+        self._output.close()
+        if self.end_fd is not None:
+            os.close(self.end_fd)
+
+
 class WorkerProcess:
     """A running worker. Made, read and ended by one thread: the kernel ties the process to the thread that made it."""
 
@@ -138,21 +174,24 @@ class WorkerProcess:
         environment: Mapping[str, str],
         logger: logging.Logger,
         kept: KeptLines | None = None,
+        starter: Path | None = None,
+        session: str = "",
     ) -> None:
-        """Start ``command`` (its first word ``python`` means this interpreter). Raises `OSError`."""
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", LAUNCHER, str(os.getpid()), *_own_python(command)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            env=dict(environment),
-            start_new_session=True,
-        )
-        self.pid = self._process.pid
-        assert self._process.stdout is not None
-        self.output_fd = self._process.stdout.fileno()
+        """Start ``command`` (its first word ``python`` means this interpreter). Raises `OSError`, `AdapterError`.
+
+        ``starter``: who starts it, as another user, with a file of its own for its ``session``; ``None``: we do.
+        """
+        words = _own_python(command)
+        self._child = _Own(words, environment) if starter is None else Hired(starter, words, environment, session)
+        self.pid = self._child.pid
+        self.group = self._child.group
+        """For the guard; ``None``: its starter kills it."""
+        self.output_fd, self.end_fd = self._child.output_fd, self._child.end_fd
+        self.has_exited = self._child.has_exited
+        """Whether the worker has ended; it is not reaped yet, so its id and group are still its own."""
+        self.signal_group = self._child.signal_group
+        """Sends a signal to the worker and everything it started in its group."""
         os.set_blocking(self.output_fd, False)
-        self.pid_fd = _open_pid_fd(self.pid)
         self._lines = LineLog(logger, kept)
         self._window_start_s = 0.0
         self._window_bytes = 0
@@ -188,18 +227,6 @@ class WorkerProcess:
         """When reading may go on (monotonic seconds); ``None``: at once."""
         return self._window_start_s + INTAKE_WINDOW_S if self._window_bytes >= INTAKE_BYTES else None
 
-    def has_exited(self) -> bool:
-        """Whether the worker has ended; it is not reaped yet, so its id and group are still its own."""
-        try:
-            return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-        except ChildProcessError:
-            return True
-
-    def signal_group(self, number: signal.Signals) -> None:
-        """Send ``number`` to the worker and everything it started in its group."""
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self.pid, number)
-
     def finish(self, now: float) -> int:
         """Kill what is left of the group, log the rest of the output, reap; returns the status as `subprocess` does."""
         self.signal_group(signal.SIGKILL)
@@ -207,16 +234,9 @@ class WorkerProcess:
             if not self.read_output(now):
                 break
         self._lines.close()
-        returncode = self._process.wait()
-        self.close_files()
+        returncode = self._child.wait()
+        self._child.close()
         return returncode
-
-    def close_files(self) -> None:
-        """Close the pipe and the process handle."""
-        assert self._process.stdout is not None
-        self._process.stdout.close()
-        if self.pid_fd is not None:
-            os.close(self.pid_fd)
 
 
 class WorkerGuard:
@@ -226,16 +246,19 @@ class WorkerGuard:
         self._process: subprocess.Popen[bytes] | None = None
         self._groups: set[int] = set()
 
-    def add(self, group: int) -> None:
-        """Watch over ``group``; starts the shell when there is none (any more)."""
+    def add(self, group: int | None) -> None:
+        """Watch over ``group``, if there is one; starts the shell when there is none (any more)."""
+        if group is None:
+            return
         self._groups.add(group)
         if not self._tell(f"+ {group}\n"):
             self._restart()
 
-    def discard(self, group: int) -> None:
+    def discard(self, group: int | None) -> None:
         """Forget ``group``; to be called before its leader is reaped and its number can be used again."""
-        self._groups.discard(group)
-        self._tell(f"- {group}\n")
+        if group in self._groups:
+            self._groups.remove(group)
+            self._tell(f"- {group}\n")
 
     def close(self) -> None:
         """End the shell; it kills the groups that are still known."""
@@ -318,17 +341,17 @@ class ProcessWatch:
         """Watch ``process``."""
         self._watched[process] = None
         self._register_output(process)
-        if process.pid_fd is None:
+        if process.end_fd is None:
             self._polled.add(process)
         else:
-            self._selector.register(process.pid_fd, selectors.EVENT_READ, lambda: None)
+            self._selector.register(process.end_fd, selectors.EVENT_READ, lambda: None)
 
     def discard(self, process: WorkerProcess) -> None:
         """Stop watching ``process``; to be called before its files are closed."""
         self._watched.pop(process, None)
         self._paused.pop(process, None)
         self._polled.discard(process)
-        for fd in (process.output_fd, process.pid_fd):
+        for fd in (process.output_fd, process.end_fd):
             if fd is not None and fd in self._selector.get_map():
                 self._selector.unregister(fd)
 

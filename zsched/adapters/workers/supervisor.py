@@ -29,6 +29,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from functools import partial
+from pathlib import Path
 from typing import Final, Protocol
 
 from zsched.adapters.workers.kept_lines import KeptLines
@@ -125,15 +126,16 @@ class Recipe(Struct, frozen=True, kw_only=True):
     environment: tuple[tuple[str, str], ...] = ()
     session: str = ""
     """The text of the session that it opens, as JSON."""
+    starter: Path | None = None
+    """Who starts it, as another user (`zsched.adapters.workers.hired`); ``None``: the daemon."""
 
     def is_old(self, new: Recipe) -> bool:
         """Whether a process that was made by this one lacks something of ``new``.
 
         Of sessions only what is missing counts: a robot that has gone is no reason to start again.
         """
-        return (self.command, self.environment) != (new.command, new.environment) or bool(
-            lacking(self.session, new.session)
-        )
+        made, now = ((one.command, one.environment, one.starter) for one in (self, new))
+        return made != now or bool(lacking(self.session, new.session))
 
 
 class _Worker(Struct, kw_only=True):
@@ -183,6 +185,7 @@ class WorkerSupervisor:
         policy: RestartPolicy | None = None,
         why_not_ready: Callable[[TaskId], str] = lambda _task: "",
         session: Callable[[TaskId], str] = lambda _task: "",
+        starter: Callable[[TaskId], Path | None] = lambda _task: None,
     ) -> None:
         """Start the supervisor's thread; no worker yet.
 
@@ -195,6 +198,7 @@ class WorkerSupervisor:
             rng: the source of the jitter; seed it in tests.
             policy: delays between restarts.
             session: called at every start: the text of the session that the worker opens.
+            starter: called at every start: who starts the worker, as another user; ``None``: this process.
             why_not_ready: asked when a start-up deadline is over: what the worker lacks, in words.
         """
         self._workers = {
@@ -204,7 +208,7 @@ class WorkerSupervisor:
         """What is wanted and not known yet: those who adopt another fleet failed with it, and will try again."""
         self._context, self._events, self._environment = context, events, environment
         self._rng, self._policy = rng or random.Random(), policy or RestartPolicy()
-        self._why_not_ready, self._session = why_not_ready, session
+        self._why_not_ready, self._session, self._starter = why_not_ready, session, starter
         self._started = 0
         self._is_blind = False
         self._guard = WorkerGuard()
@@ -374,6 +378,7 @@ class WorkerSupervisor:
             command=worker.spec.command,
             environment=tuple(sorted(environment.items())),
             session=self._session(worker.task),
+            starter=self._starter(worker.task),
         )
 
     def _on_start(self, task: TaskId) -> None:
@@ -495,11 +500,11 @@ class WorkerSupervisor:
         process: WorkerProcess | None = None
         try:
             worker.made_by = self._recipe_of(worker)
-            process = WorkerProcess(worker.spec.command, self._environment_of(worker), worker.logger, worker.kept)
-            self._guard.add(process.pid)
+            process = self._process_of(worker)
+            self._guard.add(process.group)
         except Exception as error:  # noqa: BLE001 - whatever stops a start is that worker's failure, never the daemon's
             if process is not None:
-                self._guard.discard(process.pid)
+                self._guard.discard(process.group)
                 process.finish(now)
             reason = f"cannot start: {error}"
             self._after_failure(worker, reason, now, is_last=self._count_failure(worker, reason, None, now))
@@ -508,11 +513,18 @@ class WorkerSupervisor:
         worker.deadline_s = now + worker.spec.start_deadline_s
         self._watch.add(process)
         self._compare(worker)
-        log.info("worker_started task=%s pid=%d incarnation=%d", worker.task, process.pid, worker.incarnation)
+        user = "" if worker.made_by.starter is None else f" user={worker.made_by.starter.stem}"
+        log.info("worker_started task=%s pid=%d incarnation=%d%s", worker.task, process.pid, worker.incarnation, user)
         self._tell(self._events.on_started, worker.task, process.pid, worker.incarnation)
 
+    def _process_of(self, worker: _Worker) -> WorkerProcess:
+        made, command = worker.made_by, worker.spec.command
+        environment = self._environment_of(worker)
+        return WorkerProcess(command, environment, worker.logger, worker.kept, made.starter, made.session)
+
     def _environment_of(self, worker: _Worker) -> dict[str, str]:
-        inherited = {name: value for name, value in os.environ.items() if name not in NOT_INHERITED}
+        is_ours = worker.made_by.starter is None  # another user's has the variables of its unit
+        inherited = {name: value for name, value in os.environ.items() if is_ours and name not in NOT_INHERITED}
         own = {
             "PYTHONUNBUFFERED": "1",
             "ZSCHED_FLEET": self._context.fleet,
@@ -549,7 +561,7 @@ class WorkerSupervisor:
 
     def _on_exit(self, worker: _Worker, process: WorkerProcess, now: float) -> None:
         self._watch.discard(process)
-        self._guard.discard(process.pid)
+        self._guard.discard(process.group)
         returncode = process.finish(now)
         worker.process, worker.deadline_s = None, None
         self._compare(worker)

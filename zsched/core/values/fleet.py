@@ -199,6 +199,11 @@ class WorkerSpec:
     )
     link: WorkerLink = key(WorkerLink.PEER, "How workers join the data network.")
     env: tuple[tuple[str, str], ...] = key((), "Environment.")
+    user: str = key(
+        "",
+        "As whom the worker runs on its machine, where systemd's `zsched-worker@USER.socket` is enabled.",
+        shown="`zsched-worker`, where the service starts workers",
+    )
     start_deadline_s: float = key(
         20.0,
         "Ready within this time, or the start has failed. The worker of an owner may be away for this time; for less "
