@@ -574,7 +574,7 @@ _LATER = frozenset(
         ("TaskSpec", "rollout"),
         ("TaskSpec", "cpu_floor_ratio"),
     }
-    | {("Fleet", "cells"), ("NodeSpec", "listen_streams")}
+    | {("Fleet", "cells"), ("NodeSpec", "listen_streams"), ("WorkerSpec", "user")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )
 """Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""
