@@ -33,6 +33,7 @@ from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.limits import in_turn_hz, limit_for
 from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
+from zsched.adapters.workers.hired import FOLDER, relay_socket
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import SleepWatch, monotonic_s
 from zsched.config.load import load_fleet, require_node
@@ -235,7 +236,14 @@ class Daemon:
         for fault in denied_by(self._fleet, text)[1]:
             log.warning("zenoh_file %s; %s", fault.message, fault.hint)
         self._protocol = daemon_tls.protocol_of(self._fleet, text)
-        self._texts = {side: daemon_tls.session_text(self._fleet, side) for side in Side}
+        socket = relay_socket(self._spec.name)
+        self._by_socket = f"{zenoh_config.WORKERS_BY}/{socket}"
+        self._lets_in_keyless = (
+            self._fleet.has_keyless_workers and bool(os.environ.get(FOLDER)) and socket.parent.is_dir()
+        )
+        homes = {Side.DATA: self._spec.name} if self._lets_in_keyless else {}
+        self._texts = {side: daemon_tls.session_text(self._fleet, side, home=homes.get(side, "")) for side in Side}
+        self._plain_text = text
         if self._fleet.security is not None:
             require_own(self._fleet, self._fleet.security, self._spec.name)
             self._certificate = digest_of(self._fleet.security)
@@ -374,6 +382,11 @@ class Daemon:
         )
 
     def _data_listen(self, points: Endpoints) -> tuple[str, ...]:
+        """Where the relay listens; where it cannot let workers without a key in, it works for all others."""
+        keyless = (f"{self._by_socket}#exit_on_failure=false",) if self._lets_in_keyless else ()
+        return (*self._for_members(points), *keyless)
+
+    def _for_members(self, points: Endpoints) -> tuple[str, ...]:
         """A relay keeps its process when it roams, and zenoh the addresses of its process: they are named, then.
 
         Without a local side the host's applications join this session at any address, and the process is replaced.
@@ -406,6 +419,7 @@ class Daemon:
                 WorkerLink.CLIENT: self._texts[Side.VISIT],
             },
             pools=self._pools,
+            by_socket=((self._by_socket,), self._plain_text),
         )
         stack.callback(recipes.close)
         recipes.adopt(fleet, points.worker_connect, dials_by_gossip=points.worker_by_gossip)

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from support import machine
+from support.authorities import install, make_authority
 from support.debian import NoDebianError, debian_root
 from zsched_lab.fleet.loopback import free_endpoints
 
@@ -43,6 +44,22 @@ tasks:
     weights: {cpu: 1}
     worker: {command: [sleep, "1000"], user: ghost, ready: matching}
 """
+SECURED = """
+fleet: users
+timing: wired
+nodes:
+  edge1: {kind: edge, host: 127.0.0.1, listen: {control: TLS0, data: TLS1}}
+  robot1:
+    {kind: robot, wired: true, host: 127.0.0.1, listen: {control: TLS2, data: TLS3}, local: {mode: peer, listen: [E4]}}
+tasks:
+  echo:
+    candidates: [edge1]
+    weights: {cpu: 1}
+    worker: {command: [python, /opt/probe.py], user: zsched-worker}
+    inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in", class: reliable}]
+    outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out", class: reliable, handover: all}]
+security: {}
+"""
 PROBE = """
 import json, os, runpy, socket, subprocess
 def why(act):
@@ -55,7 +72,7 @@ def ask(path):
         link.connect(path)
 told = {name: why(lambda: open(name)) for name in ("/etc/zsched/pki/key.pem", "/var/lib/zsched/state")}
 told |= {name: why(lambda: os.listdir(name)) for name in ("/var/lib/zsched", "/run/credentials/zsched.service")}
-told |= {name: why(lambda: ask(name)) for name in ("/run/zsched/robot1.sock", "/run/zsched-workers/zsched-worker.sock")}
+told |= {name: why(lambda: ask(name)) for name in ("/run/zsched/NODE.sock", "/run/zsched-workers/zsched-worker.sock")}
 told["home"] = why(lambda: open(os.path.expanduser("~/kept"), "w"))
 print("PROBE", json.dumps(told), flush=True)
 subprocess.Popen(["sleep", "1002"], start_new_session=True)
@@ -74,22 +91,25 @@ exec /usr/bin/python3 {start} "$@"
 """
 
 
-def furnish(root: Path) -> None:
-    """Put the units as they are installed, the fleet file, the workers and the driver of the test into the machine."""
-    fleet, endpoints = FLEET, free_endpoints(4)
+def furnish(root: Path, fleet: str, node: str, joins: int) -> None:
+    """Put the units as they are installed, the fleet file, the workers and the driver of the test into the machine.
+
+    The service is ``node``; applications join at the endpoint with the number ``joins``.
+    """
+    endpoints = free_endpoints(5)
     for number, endpoint in enumerate(endpoints):
-        fleet = fleet.replace(f"E{number}", endpoint)
+        fleet = fleet.replace(f"TLS{number}", endpoint.replace("tcp/", "tls/")).replace(f"E{number}", endpoint)
     units = ("zsched.service", "zsched.service.d/10-user.conf", "zsched-worker@.service", "zsched-worker@.socket")
     files = {f"etc/systemd/system/{unit}": (REPO / "systemd" / unit).read_text() for unit in units}
     files |= {
-        "etc/systemd/system/zsched.service.d/test.conf": "[Service]\nEnvironment=ZSCHED_NODE=robot1\n",
+        "etc/systemd/system/zsched.service.d/test.conf": f"[Service]\nEnvironment=ZSCHED_NODE={node}\n",
         "usr/lib/sysusers.d/zsched.conf": (REPO / "systemd/zsched.sysusers").read_text(),
         "etc/zsched/fleet.yaml": fleet,
         "etc/zsched/pki/key.pem": "-----BEGIN the node's\n",
-        "opt/endpoint": endpoints[1],
+        "opt/endpoint": endpoints[joins],
         "opt/app.py": (HERE / "deb_app.py").read_text(),
         "opt/booted/deb_drive.py": (HERE / "deb_drive.py").read_text(),
-        "opt/probe.py": PROBE,
+        "opt/probe.py": PROBE.replace("NODE", node),
         "opt/stubborn.py": STUBBORN,
     }
     starts = {"zsched": "-m zsched.cli", "python": ""}
@@ -99,16 +119,37 @@ def furnish(root: Path) -> None:
     (root / "usr/bin/zsched").symlink_to("/opt/zsched/bin/zsched")
 
 
+def certify(root: Path) -> None:
+    """Each node's certificate where it looks for it; the robot's daemon is no service, and has a file of its own."""
+    authority = make_authority(root / "srv/authority", "users")
+    install(authority, root / "etc/zsched/pki", "edge1")
+    install(authority, root / "srv/robot1/pki", "robot1")
+    (root / "srv/robot1/fleet.yaml").write_text((root / "etc/zsched/fleet.yaml").read_text())
+    (root / "opt/secured").touch()
+
+
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What was seen inside."""
+    return booted(tmp_path_factory.mktemp("users"), is_secured=False)
+
+
+@pytest.fixture(scope="module")
+def secured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The same of a secured fleet."""
+    return booted(tmp_path_factory.mktemp("secured"), is_secured=True)
+
+
+def booted(folder: Path, *, is_secured: bool) -> dict[str, Any]:
+    """What was seen inside a machine of a fleet."""
     try:
         debian = debian_root()
     except NoDebianError as error:
         pytest.skip(str(error))
-    folder = tmp_path_factory.mktemp("users")
     with machine.overlaid(debian, folder) as root:
-        furnish(root)
+        furnish(root, *((SECURED, "edge1", 4) if is_secured else (FLEET, "robot1", 1)))
+        if is_secured:
+            certify(root)
         ours = {"/opt/zsched/src/zsched": REPO / "zsched", "/opt/zsched/site": Path(sysconfig.get_paths()["purelib"])}
         found = machine.booted(folder, machine.options(root, folder, "users", ours), BOOT_TIMEOUT_S)
     assert "error" not in found, json.dumps(found, indent=1) + found["journal"]
@@ -149,3 +190,21 @@ def test_it_ends_with_its_daemon_however_that_ends(report: dict[str, Any]) -> No
     assert report["stop"]["seconds"] < 6.0
     assert report["handed_over"]
     assert report["left"] is True, report["left"]
+
+
+def test_where_a_drop_in_says_so_workers_are_the_daemons(report: dict[str, Any]) -> None:
+    assert report["as_daemon"] == {"probe.py": [], "stubborn": ["ros"], "sleep 1002": []}, report["as_daemon"]
+    assert report["run"] == [], report["run"]
+
+
+def test_in_a_secured_fleet_it_works_without_the_nodes_key(secured: dict[str, Any]) -> None:
+    assert secured["workers"]["probe.py"] == ["zsched-worker"]
+    line = next(line for line in secured["logs"]["said"].splitlines() if "PROBE" in line)
+    told = json.loads(line.partition("PROBE ")[2])
+    assert told.pop("home") is None
+    assert set(told.values()) == {"Permission denied"}, told
+    stream = secured["stream"]
+    assert secured["goes_on"], secured["journal"]
+    assert stream["sent"] > 100
+    assert (stream["missing"], stream["doubled"], stream["in_order"]) == ([], 0, True), secured["journal"]
+    assert secured["left"], secured["journal"]

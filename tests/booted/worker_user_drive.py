@@ -103,7 +103,37 @@ def observe(report: Report) -> None:
     report["starters_killed"] = holds(lambda: bool(processes("probe.py")) and not set(processes("probe.py")) & first)
     report["stop"] = said("systemctl", "stop", "zsched.service")
     report["handed_over"] = holds(lambda: status_of(EDGE_SOCKET)["tasks"][0].get("owner") == "edge1")
+    drop_in = Path("/etc/systemd/system/zsched.service.d/own.conf")
+    drop_in.write_text("[Service]\nEnvironment=ZSCHED_STARTERS=\n")
+    run("systemctl", "daemon-reload")
+    run("systemctl", "start", "zsched.service")
+    wait_for(lambda: is_settled(ROBOT_SOCKET), 60.0, "somebody owns the task")
+    run(ZSCHED, "move", "echo", "robot1", "--yes")
+    report["as_daemon"] = holds(lambda: is_settled(ROBOT_SOCKET, "robot1")) and workers()
+    run("systemctl", "stop", "zsched.service", "zsched-worker@*")
+    report["run"] = sorted(str(path) for path in Path("/run").glob("zsched*"))
     report["left"] = holds(lambda: not processes(), 5.0) or {pid: run("ps", str(pid)).stdout for pid in processes()}
+
+
+def observe_secured(report: Report) -> None:
+    """The service as edge1, whose worker has not its key, and beside it robot1, whose application asks."""
+    run("systemd-sysusers", "/usr/lib/sysusers.d/zsched.conf")
+    robot = ["--config", "/srv/robot1/fleet.yaml", "--node", "robot1", "--state-dir", "/srv/robot1/state"]
+    report["init"] = [said(ZSCHED, "init", "--config", FLEET, "--node", "edge1"), said(ZSCHED, "init", *robot)]
+    report["start"] = said("systemctl", "start", "zsched.service")
+    command = ["systemd-run", "--unit=robot1", "--service-type=exec", "-p", "KillMode=mixed", ZSCHED, "up", *robot]
+    report["start_robot"] = said(*command, "--runtime-dir", "/srv/robot1/run")
+    robot_socket = Path("/srv/robot1/run/robot1.sock")
+    wait_for(lambda: is_settled(robot_socket, "edge1"), 60.0, "edge1 owns the task")
+    stream = Stream("secured")
+    report["workers"], report["logs"] = workers(), said(ZSCHED, "logs", "echo", "edge1")
+    report["restarted"] = said("systemctl", "restart", "zsched.service")  # the relay stays
+    stream_goes_on = stream.heard()
+    report["goes_on"] = holds(lambda: stream.heard() > stream_goes_on + 50, 60.0)
+    report["stream"] = stream.end()
+    report["problems"] = status_of(robot_socket).get("problems")
+    report["stop"] = said("systemctl", "stop", "zsched.service")
+    report["left"] = holds(lambda: not processes(), 5.0)
 
 
 def crash(report: Report) -> None:
@@ -119,10 +149,23 @@ def crash(report: Report) -> None:
 def main() -> int:
     report: Report = {}
     try:
-        observe(report)
+        (observe_secured if Path("/opt/secured").exists() else observe)(report)
     except Exception as error:  # noqa: BLE001 - whatever happens, the report is written and the machine goes off
         report["error"] = repr(error)
-    journal = ("journalctl", "--no-pager", "-o", "short-monotonic", "-n", "200", "-u", "zsched*", "-u", "edge1")
+    journal = (
+        "journalctl",
+        "--no-pager",
+        "-o",
+        "short-monotonic",
+        "-n",
+        "200",
+        "-u",
+        "zsched*",
+        "-u",
+        "edge1",
+        "-u",
+        "robot1",
+    )
     report["journal"] = run(*journal).stdout
     RESULT.write_text(json.dumps(report, indent=1))
     run("systemctl", "poweroff", "--force")

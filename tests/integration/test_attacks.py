@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from zsched.config.load import check_file
 from zsched.core import events as ev
 from zsched.core.events import RoleEnded
 from zsched.core.values.certificates import Role
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, WorkerLink
 from zsched.core.values.messages import Learnt, MoveTask
 from zsched.core.values.model import Asked
 from zsched.pki.authority import Authority
@@ -41,7 +42,7 @@ from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.tls import session_text
 from zsched.sessions import config as zenoh_config
 from zsched.sessions import expulsion
-from zsched.sessions.expulsion import HOLD_S, MAX_SHOWN, Expulsion, members_of
+from zsched.sessions.expulsion import HOLD_S, MAX_SHOWN, Expulsion, Refusal, members_of
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 
@@ -818,3 +819,53 @@ def test_an_order_that_is_not_signed_bears_the_name_of_its_link(fresh: Yard, who
             return [event.command.asked for event in events if isinstance(event, ev.MoveCommanded)]
 
         assert until(orders, "the order")[0] == Asked(by=said, reason="mine")
+
+
+def heard_of(victim: Victim, key: str) -> bool:
+    """Whether a sample of that key and a token have come."""
+    return bool(victim.tokens) and key in victim.heard
+
+
+def test_a_worker_without_the_key_speaks_as_a_worker_of_its_node_only(fresh: Yard) -> None:
+    """It joins its own relay by a socket; what the rules let through goes on to the members, with the node's name."""
+    endpoint, path = free_endpoint().replace("tcp/", "tls/"), fresh.folder / "edge1.sock"
+    by_socket = f"{zenoh_config.WORKERS_BY}/{path}"
+    rules = session_text(fresh.fleet("edge1"), Side.DATA, home="edge1")
+    text = zenoh_config.data_config(listen=(endpoint, by_socket), connect=(), operator_json5=rules)
+    worker_text = zenoh_config.worker_config(connect=(by_socket,), link=WorkerLink.CLIENT)
+    theirs, refused = session_text(fresh.fleet("robot1"), Side.DATA), list[Refusal]()
+    with contextlib.ExitStack() as stack:
+        relay = Victim(stack.enter_context(zenoh.open(zenoh.Config.from_json5(text))), endpoint.partition("#")[0])
+        relay.listen()
+        members = members_of(text)
+        assert members is not None
+        watch = Expulsion(relay.session, "yard", members, lambda why, _: refused.append(why), has_streams=True)
+        stack.callback(watch.close)
+        far_text = zenoh_config.data_config(listen=(), connect=(relay.endpoint,), operator_json5=theirs)
+        far = Victim(stack.enter_context(zenoh.open(zenoh.Config.from_json5(far_text))), "")
+        far.listen()
+        until(lambda: relay.links() and far.links(), "the relays are linked")
+        worker = stack.enter_context(zenoh.open(zenoh.Config.from_json5(worker_text)))
+        inputs = list[str]()
+        worker.declare_subscriber("edge1/merge/*/in", lambda sample: inputs.append(str(sample.key_expr)))
+        time.sleep(2 * HOLD_S)  # a stranger's link would be ended by now
+        node, others = KEYS.all_puts().removesuffix("*/*"), ("robot1", "robot2")
+        for key in (
+            *(f"{node}{kind}/{name}" for kind in ("beat", "proposal", "allocation") for name in ("edge1", "robot1")),
+            *(KEYS.role(name, "merge") for name in ("edge1", *others)),
+            *(KEYS.ack(name, "merge", "1", "ab") for name in others),
+            *(KEYS.received(name, "ab", "cd") for name in ("edge1", "robot1")),
+            *("robot1/in", "robot1/out", "edge1/merge/robot1/in", "other/merge/robot1/out"),
+        ):
+            worker.put(key, b"forged")
+        for key in (KEYS.relay("edge1", "ab"), KEYS.alive("edge1", "9"), KEYS.worker("robot2", "merge", "9")):
+            stack.callback(worker.liveliness().declare_token(key).undeclare)
+        said = [KEYS.trouble("edge1", "merge", "9"), KEYS.ack("edge1", "merge", "9", "ab"), "edge1/merge/robot1/out"]
+        for key in said:
+            worker.put(key, b"true")
+        stack.callback(worker.liveliness().declare_token(KEYS.worker("edge1", "merge", "9")).undeclare)
+        for victim in (relay, far):
+            until(partial(heard_of, victim, said[-1]), "what a worker may say")
+            assert (sorted(victim.heard), victim.tokens) == (sorted(said), [KEYS.worker("edge1", "merge", "9")])
+        until(lambda: far.session.put("edge1/merge/robot1/in", b"1") or inputs, "an input of another machine")
+        assert refused == []

@@ -323,7 +323,7 @@ def _sessions(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     for name in come:
         node = f"nodes.{name}"
         paths = (f"{node}.listen", f"{node}.host") if name in before else (node,)
-        dialling = (task for task in new.tasks if task.name in tasks and task.worker.link is WorkerLink.PEER)
+        dialling = (task for task in new.tasks if task.name in tasks and new.link_of(task) is WorkerLink.PEER)
         for verdict in map(_renewed, dialling):
             yield replace(verdict, text=f"{verdict.text}, to dial {name}", paths=paths)
     yield from _by_gossip(old, new)
@@ -342,7 +342,7 @@ def _by_gossip(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     for task in new.tasks:
         homes = [one.name for one in new.nodes if one.name in stay and runs_worker(task, one.name, one.kind)]
         differs = any(bool(before - {home}) is not bool(after - {home}) for home in homes)
-        if task.name in tasks and task.worker.link is WorkerLink.PEER and differs:
+        if task.name in tasks and new.link_of(task) is WorkerLink.PEER and differs:
             verdict = _renewed(task)
             text = f"{verdict.text}, to find {name}" if name in after else verdict.text
             yield replace(verdict, text=text, paths=paths)
@@ -389,6 +389,11 @@ def _access(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
     for name in dict.fromkeys((*then, *speaking)):
         if speaking.get(name) != then.get(name):
             yield replace(anew, paths=(f"tasks.{name}",))
+    if old.has_keyless_workers != new.has_keyless_workers:  # relays listen for them, or not any more
+        users, had = ({task.name: task.worker.user for task in fleet.tasks} for fleet in (old, new))
+        for name in dict.fromkeys((*had, *users)):
+            if users.get(name) != had.get(name):
+                yield replace(anew, paths=(f"tasks.{name}",))
 
 
 def _let_in(security: Security, nodes: Sequence[NodeId]) -> tuple[object, ...]:

@@ -125,9 +125,6 @@ def check_secured(section: Section, out: Collector) -> None:
         if worker is not None and worker.get("driver") is Driver.ROS2_LIFECYCLE:
             message = "a secured fleet lets nobody lead a managed node: its services are no streams of the fleet"
             out.error(worker.where("driver"), message, "start the node by `command:` alone, and leave `driver:` out")
-        if worker is not None and worker.get("user"):
-            message = "a worker of a secured fleet joins by its node's key, which only the daemon's user may read"
-            out.error(worker.where("user"), message, "leave `user:` out")
 
 
 def _of(section: Section, *names: str) -> dict[str, Any]:
@@ -237,6 +234,8 @@ def _worker(given: Section, out: Collector) -> WorkerSpec:
         message = "a cold standby is started on the move, and this worker has no `command` to start it with"
         hint = "give its `command`, or delete `standby`: a worker that somebody else starts counts wherever it runs"
         out.error(section.where("standby"), message, hint)
+    if "user" in section.places and section.is_whole and not (command or section.get("command")):
+        out.error(section.where("user"), "nobody starts this worker: it has no `command`", "leave `user:` out")
     return section.build(WorkerSpec, out, env=pairs, **ready, **words) or WorkerSpec()
 
 

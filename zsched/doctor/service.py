@@ -166,7 +166,7 @@ def starter_of_service(scene: Scene, worker: WorkerSpec) -> Path | None:
     unit = _unit(scene)
     said = [] if unit is None else [value for name, value in _settings(scene, unit) if name == "Environment"]
     env = dict(word.partition("=")[::2] for value in said for word in value.split())
-    return starter_for(worker, scene.fleet, {FOLDER: str(scene.at(env[FOLDER]))} if FOLDER in env else {})
+    return starter_for(worker, scene.fleet, {FOLDER: str(scene.at(env[FOLDER]))} if env.get(FOLDER) else {})
 
 
 def path_of_service(scene: Scene) -> str | None:

@@ -28,6 +28,7 @@ from zsched.clock import awake_s, monotonic_s
 from zsched.core.events import FrameDropped, ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
+from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
 from zsched.errors import WireError
@@ -49,7 +50,7 @@ from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
 from zsched.sessions.closing import ALARM_S, CLOSE_S
-from zsched.sessions.config import lease_s
+from zsched.sessions.config import WORKERS_BY, lease_s, setting
 from zsched.sessions.expulsion import MAX_DATA_SESSIONS, Expulsion, Refusal, members_of
 from zsched.sessions.link_sockets import opened
 from zsched.sessions.problems import why_not_open
@@ -460,6 +461,15 @@ def _standbys_of(task: TaskId) -> str:
     return f"{task}@standbys"
 
 
+def _opened(config: str) -> zenoh.Session:
+    session = opened(config)
+    for end in setting(config, "listen/endpoints"):
+        if end.startswith(f"{WORKERS_BY}/"):
+            with contextlib.suppress(OSError):  # zenoh could not listen there
+                Path(Endpoint.of(end).address).chmod(0o666)  # its folder says who comes so far
+    return session
+
+
 def _opened_in_time(config: str) -> zenoh.Session:
     """A session; its port may be free a moment later only.
 
@@ -469,7 +479,7 @@ def _opened_in_time(config: str) -> zenoh.Session:
     until = awake_s() + END_S
     while True:
         try:
-            return opened(config)
+            return _opened(config)
         except zenoh.ZError:
             if awake_s() >= until:
                 raise
@@ -504,7 +514,7 @@ def run(
         return 0
     config = text.decode()
     try:
-        session = opened(config)
+        session = _opened(config)
     except (zenoh.ZError, ValueError) as error:
         problem = f"its data session {why_not_open(config, error)}"
         reporter.report(ProblemReported(source=SOURCE, problem=problem))

@@ -20,8 +20,9 @@ from zsched.core.route.ros2 import BUFFERS, is_rmw_key
 from zsched.core.route.route import widened
 from zsched.core.values.certificates import Role, accepted
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, StreamRule, TaskSpec, runs_worker
-from zsched.core.values.model import NodeKind
+from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.plan import Direction, RosGraph
+from zsched.sessions.config import WORKERS_BY
 from zsched.wire.keyspace import ROOT, Keyspace
 
 Json = dict[str, Any]
@@ -51,13 +52,19 @@ class Side(StrEnum):
     """A client's: what comes by its one link, a member has passed on."""
 
 
-def access_control(fleet: Fleet, security: Security, side: Side) -> Json:
-    """The value of zenoh's ``access_control`` for a session of ``fleet``."""
+def access_control(fleet: Fleet, security: Security, side: Side, home: NodeId = "") -> Json:
+    """The value of zenoh's ``access_control`` for a session of ``fleet``.
+
+    ``home``: the node whose workers join this session without a certificate, by a socket that only they reach.
+    """
     rules: list[Json] = []
     policies: list[Json] = []
     subjects: list[Json] = []
-    for subject, names, own in _holders(fleet, security, side):
-        subjects.append({"id": subject, "cert_common_names": names})
+    holders = [(subject, {"cert_common_names": names}, own) for subject, names, own in _holders(fleet, security, side)]
+    if home:
+        holders.append(("workers", {"link_protocols": [WORKERS_BY]}, list(_worker_rules(fleet, fleet.node(home)))))
+    for subject, who, own in holders:
+        subjects.append({"id": subject, **who})
         for number, (flow, messages, keys) in enumerate(own):
             name = f"{subject} {number}"
             rules.append(
@@ -179,6 +186,23 @@ def _node_rules(fleet: Fleet, node: NodeSpec, side: Side) -> Iterator[Rule]:
     yield "egress", ALL, everything
 
 
+def _worker_rules(fleet: Fleet, node: NodeSpec) -> Iterator[Rule]:
+    """What its node's relay passes on of a worker: what the library says, and the streams of the node's tasks."""
+    keys, everything = Keyspace(fleet.name), _everything(fleet)
+    of_library = [
+        keys.worker(node.name, "*", "*"),
+        f"{keys.role(node.name, '*')}/*",
+        keys.trouble(node.name, "*", "*"),
+        keys.ack(node.name, "*", "*", "*"),
+        keys.snapshot(node.name, "*"),
+    ]
+    spoken = [key for task in fleet.tasks for rule in task.rules for key in _answered(fleet, task, rule, node)]
+    yield "ingress", SPEAK, [*of_library, *_with_suffixes(spoken), *_graph(fleet)]
+    yield "ingress", ASK, [keys.role(node.name, "*"), keys.snapshot("*", "*")]
+    yield "ingress", LISTEN, everything
+    yield "egress", ALL, everything
+
+
 def _visitor_rules(fleet: Fleet, name: str, role: Role, side: Side) -> Iterator[Rule]:
     keys = Keyspace(fleet.name)
     if side is Side.CONTROL:
@@ -236,7 +260,6 @@ def _stream_keys(fleet: Fleet, node: NodeSpec) -> tuple[list[str], list[str]]:
 
 def _keys_of(fleet: Fleet, task: TaskSpec, rule: StreamRule, node: NodeSpec) -> tuple[list[str], list[str]]:
     here = {"robot": node.name, "node": node.name, "task": task.name}
-    there = {"target": node.name, "task": task.name}
     inner = rule.to_template if rule.direction is not Direction.OUTPUT else rule.from_template
     outer = rule.from_template if rule.direction is not Direction.OUTPUT else rule.to_template
     speaks: list[str] = []
@@ -250,10 +273,16 @@ def _keys_of(fleet: Fleet, task: TaskSpec, rule: StreamRule, node: NodeSpec) -> 
         asks += towards
         if rule.direction is Direction.INPUT:
             speaks += towards
-    if rule.direction is not Direction.INPUT and runs_worker(task, node.name, node.kind):
-        robots = [one.name for one in fleet.nodes if one.kind is NodeKind.ROBOT]
-        speaks += _opened(inner, ("robot", "node"), robots, there)
-    return speaks, asks
+    return [*speaks, *_answered(fleet, task, rule, node)], asks
+
+
+def _answered(fleet: Fleet, task: TaskSpec, rule: StreamRule, node: NodeSpec) -> list[str]:
+    """The keys under which a node's worker puts out and serves."""
+    if rule.direction is Direction.INPUT or not runs_worker(task, node.name, node.kind):
+        return []
+    inner = rule.to_template if rule.direction is not Direction.OUTPUT else rule.from_template
+    robots = [one.name for one in fleet.nodes if one.kind is NodeKind.ROBOT]
+    return _opened(inner, ("robot", "node"), robots, {"target": node.name, "task": task.name})
 
 
 def _opened(template: str, free: tuple[str, ...], names: Iterable[str], known: dict[str, str]) -> list[str]:

@@ -49,14 +49,17 @@ class Recipes:
         shared_memory: bool,
         operator_json5: Mapping[WorkerLink, str],
         pools: str | None,
+        by_socket: tuple[tuple[str, ...], str] = ((), ""),
     ) -> None:
         """``folder``: where the session files go; ``read``: of workers that somebody else starts.
 
         ``operator_json5``: {how a worker joins: the settings of zenoh that every such session has}; ``pools``: zenoh's
-        pools of threads as an operator has set them for this node's processes.
+        pools of threads as an operator has set them for this node's processes; ``by_socket``: where a worker without
+        the key of a secured fleet dials its relay, and its settings of zenoh.
         """
         self._me, self._folder, self.read = me, folder, read
         self._shared_memory, self._operator_json5, self._pools = shared_memory, operator_json5, pools
+        self._by_socket = by_socket
         self._made = _Made(specs={}, sessions={}, environments={}, starters={})
         self._written: dict[TaskId, str] = {}
         """{task: the session in its file}, of another fleet than the recipes where one could not be written."""
@@ -96,18 +99,19 @@ class Recipes:
         """
         kind = fleet.node(self._me).kind
         mine = [task for task in fleet.tasks if runs_worker(task, self._me, kind)]
-        sessions = {
-            task.name: zenoh_config.worker_config(
-                connect=connect,
+        sessions = {}
+        for task in mine:
+            is_keyless = fleet.security is not None and task.worker.user
+            dialled, settings = self._by_socket if is_keyless else (connect, self._operator_json5[task.worker.link])
+            sessions[task.name] = zenoh_config.worker_config(
+                connect=dialled,
                 listen=(),
                 timing=fleet.timing,
-                link=task.worker.link,
+                link=fleet.link_of(task),
                 shared_memory=self._shared_memory,
-                operator_json5=self._operator_json5[task.worker.link],
+                operator_json5=settings,
                 dials_by_gossip=dials_by_gossip,
             )
-            for task in mine
-        }
         for name, text in sessions.items():
             if text != self._written.get(name):
                 self._write(name, text)
@@ -168,7 +172,10 @@ class Recipes:
 
 
 def starter_for(worker: WorkerSpec, fleet: Fleet, env: Mapping[str, str] = os.environ) -> Path | None:
-    """Who starts a worker, as another user; a secured fleet's joins by the node's key, which only the daemon reads."""
+    """Who starts a worker, as another user.
+
+    In a secured fleet that is asked for: without the node's key it joins by its own relay alone (`link: client`).
+    """
     if runs_as_the_daemon(worker.command) or (fleet.security is not None and not worker.user):
         return None
     return starter_of(worker.user, env)

@@ -50,6 +50,8 @@ def opens_anew(old: Fleet, new: Fleet) -> bool:
     before, after = old.security, new.security
     if before is None or after is None:
         return False
+    if old.has_keyless_workers != new.has_keyless_workers:
+        return True
     return any(access_control(old, before, side) != access_control(new, after, side) for side in Side)
 
 

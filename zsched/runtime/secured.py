@@ -16,6 +16,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.core.values.certificates import Holder, Role, accepted, parse_common_name
 from zsched.core.values.fleet import Fleet, Security
+from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct
 from zsched.errors import ConfigError
 from zsched.files import owner_of, read_regular
@@ -119,11 +120,16 @@ def _is_handed(path: Path) -> bool:
 
 
 def secured_text(
-    fleet: Fleet, security: Security, side: Side, operator_json5: str, env: Mapping[str, str] = os.environ
+    fleet: Fleet,
+    security: Security,
+    side: Side,
+    operator_json5: str,
+    env: Mapping[str, str] = os.environ,
+    home: NodeId = "",
 ) -> str:
     """The zenoh configuration on which a session of a secured fleet is built; over the operator's own.
 
-    ``env``: as in `files_of`.
+    ``env``: as in `files_of`; ``home``: as in `access_control`.
 
     Raises:
         ConfigError: a file is missing or cannot be read.
@@ -131,13 +137,14 @@ def secured_text(
     files = files_of(security, env)
     for path in (files.certificate, files.key, files.trusted):
         bytes_of(path)
-    rules = access_control(fleet, security, side)
+    rules = access_control(fleet, security, side, home)
     return zenoh_config.secured(
         certificate=str(files.certificate),
         key=str(files.key),
         trusted=str(files.trusted),
         rules=rules,
         operator_json5=operator_json5,
+        protocols=("tls", zenoh_config.WORKERS_BY) if home else ("tls",),
     )
 
 

@@ -13,6 +13,7 @@ from typing import Final
 
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet, NodeSpec
+from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Exposure
 from zsched.errors import ConfigError
 from zsched.runtime.access_rules import Side
@@ -25,16 +26,16 @@ ENCRYPTED: Final = ("tls", "quic")
 TO_LISTEN: Final = ("listen_certificate", "listen_private_key")
 
 
-def session_text(fleet: Fleet, side: Side, env: Mapping[str, str] = os.environ) -> str:
+def session_text(fleet: Fleet, side: Side, env: Mapping[str, str] = os.environ, home: NodeId = "") -> str:
     """The zenoh configuration on which sessions of one kind are built: the operator's own, secured where the file says.
 
-    ``env``: where systemd has put this machine's key, if it has.
+    ``env``: where systemd has put this machine's key, if it has; ``home``: as in `access_control`.
 
     Raises:
         ConfigError: the operator's file or this machine's certificate cannot be used.
     """
     text = operator_json5(fleet)
-    return text if fleet.security is None else secured_text(fleet, fleet.security, side, text, env)
+    return text if fleet.security is None else secured_text(fleet, fleet.security, side, text, env, home)
 
 
 def asker_in(fleet: Fleet, name: str) -> str:

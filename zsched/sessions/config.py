@@ -30,6 +30,8 @@ CONTROL_MAX_MESSAGE: Final = 1 << 20
 """Largest control message a peer may make us assemble, bytes (zenoh's default is 1 GiB)."""
 CONTROL_KEEP_ALIVE: Final = 3
 """Signs of life in a lease of the control session, whose beats are more frequent than that, at rest, too."""
+WORKERS_BY: Final = "unixsock-stream"
+"""The protocol by which workers of other users join their relay in a secured fleet, whose key they have not."""
 LOOPBACK_LISTEN: Final = "tcp/127.0.0.1:0"
 
 OPEN_TIMEOUT_S: Final = 1.5
@@ -270,7 +272,15 @@ def tls_settings(operator_json5: str) -> Settings:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def secured(*, certificate: str, key: str, trusted: str, rules: Settings, operator_json5: str = "") -> str:
+def secured(
+    *,
+    certificate: str,
+    key: str,
+    trusted: str,
+    rules: Settings,
+    operator_json5: str = "",
+    protocols: tuple[str, ...] = ("tls",),
+) -> str:
     """The operator's text with TLS both ways and access control over it; the other three are paths, PEM.
 
     Which address a certificate is for is not looked at: robots change theirs. A connecting session also trusts the
@@ -281,7 +291,7 @@ def secured(*, certificate: str, key: str, trusted: str, rules: Settings, operat
         ValueError: the operator's JSON5 is not a zenoh configuration.
     """
     settings: Settings = {
-        "transport/link/protocols": ["tls"],
+        "transport/link/protocols": list(protocols),
         "transport/link/tls": {
             "root_ca_certificate": trusted,
             "enable_mtls": True,

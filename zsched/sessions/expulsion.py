@@ -28,6 +28,7 @@ import zenoh
 from zsched.clock import monotonic_s
 from zsched.core.values.certificates import Role, parse_common_name
 from zsched.guard import guarded, tolerant
+from zsched.sessions.config import WORKERS_BY
 from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
 
 MAX_SHOWN: Final = 64
@@ -165,7 +166,7 @@ class Expulsion:
                 self._refuse(zid, Refusal.SHUT_OUT, name)
             elif not self._has_room(name, zid, is_present=is_present):
                 self._refuse(zid, Refusal.TOO_MANY, name)
-        elif is_present:
+        elif is_present and not str(event.link.src).startswith(f"{WORKERS_BY}/"):  # its rules are by the protocol
             _log.warning("stranger certificate=%r address=%s: it may nothing here", name, event.link.dst)
             self._refuse(zid, Refusal.STRANGER, name)
 

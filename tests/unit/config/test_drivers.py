@@ -83,6 +83,7 @@ def test_without_a_driver_the_command_is_the_operators() -> None:
         ("{driver: container, image: a, engine: lxc}", "`podman` or `docker`", 51),
         ("{driver: systemd, unit: a.service, user: ros}", "hint: the unit has a `User=`", 54),
         ("{driver: container, image: a, user: ros}", "driver container has no 'user'", 49),
+        ("{user: ros}", "it has no `command`", 20),
         ("{command: [a], user: Root}", "'Root' is not a user of the machine", 34),
         ("{driver: sysd, unit: a.service}", "did you mean 'systemd'?", 22),
     ],

@@ -19,6 +19,8 @@ from zsched.errors import AdapterError
 FOLDER: Final = "ZSCHED_STARTERS"
 """Where the sockets are, `USER.sock`; the unit says it. Without: workers whose task names no user are the daemon's."""
 STARTERS: Final = "/run/zsched-workers"
+RELAYS: Final = ".relay"
+"""The folder beside the sockets, of the daemon and the group of all workers' users."""
 USER: Final = "zsched-worker"
 """Of a task that names none."""
 START_S: Final = 3.0
@@ -30,8 +32,13 @@ def starter_of(user: str, env: Mapping[str, str] = os.environ) -> Path | None:
 
     A user that is named is never replaced by the daemon's own: its socket may not be there.
     """
-    path = Path(env.get(FOLDER, STARTERS), f"{user or USER}.sock")
-    return path if user or (FOLDER in env and path.exists()) else None
+    path = Path(env.get(FOLDER) or STARTERS, f"{user or USER}.sock")
+    return path if user or (env.get(FOLDER) and path.exists()) else None
+
+
+def relay_socket(node: str, env: Mapping[str, str] = os.environ) -> Path:
+    """Where the relay of a secured fleet listens for such workers: its folder lets nobody else through."""
+    return Path(env.get(FOLDER) or STARTERS, RELAYS, f"{node}.sock")
 
 
 class Hired:

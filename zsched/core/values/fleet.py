@@ -511,6 +511,16 @@ class Fleet:
         """The robots, sorted: they have utilities and proposals."""
         return tuple(node.name for node in self.nodes if node.kind is NodeKind.ROBOT)
 
+    @property
+    def has_keyless_workers(self) -> bool:
+        """Whether a task's workers have a user of their own, who may not read the key of a secured fleet's node."""
+        return self.security is not None and any(task.worker.user for task in self.tasks)
+
+    def link_of(self, task: TaskSpec) -> WorkerLink:
+        """How a task's workers join: by their own relay alone where they have no key."""
+        is_keyless = self.security is not None and task.worker.user
+        return WorkerLink.CLIENT if is_keyless else task.worker.link
+
     def node(self, name: NodeId) -> NodeSpec:
         """The node called ``name``. Raises `KeyError` when the fleet has none."""
         for node in self.nodes:
