@@ -24,7 +24,9 @@ LAB = PACKAGE.parent / "lab" / "zsched_lab"
 
 @pytest.fixture
 def told() -> Iterator[list[tuple[str, str]]]:
-    """What the guard tells of this test's threads."""
+    """What the guard tells of this test's threads; threads of the tests before it may have failed."""
+    guard.failures.clear()
+    guard._failed_at.clear()
     heard: list[tuple[str, str]] = []
     before = tuple(guard._listeners)
     guard.on_failure(lambda kind, text: heard.append((kind, text)))
