@@ -119,8 +119,12 @@ def test_the_advice_of_init_leads_to_a_fleet_that_agrees(bed: Testbed) -> None:
         assert done.returncode == 0, (node, done.stderr)
     bed.start()
     bed.wait_settled()
-    quorums = [bed.status(node)["quorum"] for node in bed.names]
-    assert [(one["alive"], one["stateless"], one["apart"]) for one in quorums] == [(3, [], [])] * len(quorums)
+
+    def agrees(node: str) -> bool:
+        quorum = bed.status(node)["quorum"]
+        return (quorum["alive"], quorum["stateless"], quorum["apart"]) == (3, [], [])
+
+    bed.wait(lambda: all(agrees(node) for node in bed.names), 60, "every node to count all of them")
     assert bed.task("robot1")["epoch"] > 2**32
 
 

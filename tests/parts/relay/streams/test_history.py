@@ -139,6 +139,7 @@ def test_a_publisher_that_stood_still_while_it_was_asked_is_asked_again(
         net.receive()
         until(lambda: unanswered and not under_way, "every question so far has ended without an answer")
         assert not net.got
+        monkeypatch.undo()
         process.send_signal(signal.SIGCONT)
         until(lambda: net.got == ["frozen 1", "frozen 2"], "what it holds")
 
