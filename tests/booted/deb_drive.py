@@ -6,6 +6,7 @@ library: this file is copied into a fresh Debian. The verdict is the test's; her
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pwd
@@ -154,6 +155,16 @@ def as_user(name: str, *command: str) -> dict[str, Any]:
     return said("setpriv", f"--reuid={name}", f"--regid={name}", "--init-groups", *command)
 
 
+def users_of(word: str) -> list[str]:
+    """The users of all processes whose command line has a word."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if folder.name.isdecimal() and word.encode() in (folder / "cmdline").read_bytes():
+                found.append(pwd.getpwuid(folder.stat().st_uid).pw_name)
+    return sorted(found)
+
+
 def members(report: Report) -> None:
     """Two people: one in the group, one not."""
     for name in ("ada", "eve"):
@@ -277,6 +288,7 @@ def observe(report: Report) -> None:
     bash = ["bash", "-c", f". {SHARE}/bash-completion/completions/zsched; complete -p zsched"]
     report["completion"] = run(*bash).stdout.strip()
     begin_fleet(report)
+    report["users"] = users_of("zsched.tasks.echo")
     report["first"] = status_of(ROBOT_SOCKET).get("version")
     members(report)
     report["upgrade"] = changed("new")

@@ -126,6 +126,11 @@ def test_it_does_not_mix_with_an_installation_by_pip(report: dict[str, Any], giv
     assert "holds an installation by pip" in report["refused"]["said"]
 
 
+def test_workers_of_the_service_are_not_its_user(report: dict[str, Any]) -> None:
+    """The daemon beside it is root's."""
+    assert report["users"] == ["root", "zsched-worker"]
+
+
 def test_members_of_the_group_may_ask_and_others_may_not(report: dict[str, Any]) -> None:
     assert report["socket"] == ["zsched", "0o660"]
     assert report["member"]["code"] == 0, report["member"]

@@ -174,8 +174,10 @@ class Recipes:
 def starter_for(worker: WorkerSpec, fleet: Fleet, env: Mapping[str, str] = os.environ) -> Path | None:
     """Who starts a worker, as another user.
 
-    In a secured fleet that is asked for: without the node's key it joins by its own relay alone (`link: client`).
+    In a secured fleet, or by an operator's zenoh file, sessions may need a key that only the daemon's user reads: there
+    another user must be asked for. In a secured fleet it then joins by its own relay alone.
     """
-    if runs_as_the_daemon(worker.command) or (fleet.security is not None and not worker.user):
+    may_need_key = fleet.security is not None or fleet.zenoh_config
+    if runs_as_the_daemon(worker.command) or (may_need_key and not worker.user):
         return None
     return starter_of(worker.user, env)

@@ -12,10 +12,11 @@ import pytest
 import zenoh
 
 from support.fleets import fleet_of, task_of
-from zsched.core.values.fleet import WorkerLink, WorkerSpec
+from zsched.adapters.workers.hired import FOLDER
+from zsched.core.values.fleet import Security, WorkerLink, WorkerSpec
 from zsched.errors import AdapterError
 from zsched.runtime import recipes as recipes_module
-from zsched.runtime.recipes import Recipes
+from zsched.runtime.recipes import Recipes, starter_for
 from zsched.runtime.sessions import SessionsRead
 
 HERE, THERE = ("tcp/127.0.0.1:7458",), ("tcp/127.0.0.1:7458", "tcp/192.0.2.1:7458")
@@ -99,3 +100,39 @@ def test_a_program_that_knows_zenohs_own_variable_joins_the_data_network(
     assert environment["ZENOH_CONFIG"] == environment["ZENOH_SESSION_CONFIG_URI"] == str(recipes.paths["merge"])
     monkeypatch.setenv("ZENOH_CONFIG", environment["ZENOH_CONFIG"])
     assert HERE[0] in zenoh.Config.from_env().get_json("connect/endpoints")
+
+
+def test_a_worker_whose_session_may_need_a_key_is_the_daemons_unless_its_task_names_a_user(tmp_path: Path) -> None:
+    """TLS by hand names files that only the daemon's user reads."""
+    (tmp_path / "zsched-worker.sock").touch()
+    env, plain, secured = {FOLDER: str(tmp_path)}, fleet_of(MERGE), fleet_of(MERGE, security=Security(folder="pki"))
+    by_hand, ros = fleet_of(MERGE, zenoh_config="tls.json5"), WorkerSpec(command=("work",), user="ros")
+    unit = WorkerSpec(command=("python", "-m", "zsched.drivers.systemd", "--unit", "merge.service"))
+    assert starter_for(MERGE.worker, plain, env) == tmp_path / "zsched-worker.sock"
+    assert [starter_for(MERGE.worker, fleet, env) for fleet in (secured, by_hand)] == [None, None]
+    assert [starter_for(ros, fleet, env) for fleet in (secured, by_hand)] == [tmp_path / "ros.sock"] * 2
+    assert starter_for(unit, plain, env) is None
+    assert starter_for(MERGE.worker, plain, {}) is None
+
+
+def test_a_worker_without_the_key_dials_its_own_relay_only(tmp_path: Path) -> None:
+    keyed = dict.fromkeys(WorkerLink, '{transport: {link: {tls: {connect_private_key: "/k"}}}}')
+    made = Recipes(
+        "edge1",
+        tmp_path,
+        SessionsRead(tmp_path / "state"),
+        shared_memory=False,
+        operator_json5=keyed,
+        pools=None,
+        by_socket=(("unixsock-stream//run/r.sock",), "{}"),
+    )
+    task = task_of("merge", worker=WorkerSpec(command=("work",), user="ros"))
+    made.adopt(fleet_of(task, PLAN, security=Security(folder="pki")), THERE, dials_by_gossip=False)
+    assert "/k" in made.session("plan")
+    assert "/k" not in made.session("merge")
+    settings = zenoh.Config.from_json5(made.session("merge"))
+    assert (settings.get_json("mode"), settings.get_json("connect/endpoints")) == (
+        '"client"',
+        '["unixsock-stream//run/r.sock"]',
+    )
+    made.close()
