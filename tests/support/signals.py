@@ -20,10 +20,24 @@ def signal_at_once(process: subprocess.Popen[Any], *numbers: signal.Signals) -> 
         process.send_signal(number)
 
 
+def stand_still(process: subprocess.Popen[Any]) -> None:
+    """SIGSTOP; waits until no thread of the process runs any more.
+
+    The first thread that has the signal stops the others. On a busy machine they go on until it gets a processor.
+    """
+    process.send_signal(signal.SIGSTOP)
+    tasks = Path(f"/proc/{process.pid}/task")
+    until(lambda: {_state(one) for one in tasks.iterdir()} == {"T"}, "all threads stopped")
+
+
+def _state(task: Path) -> str:
+    """proc_pid_stat(5), of one thread."""
+    return (task / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+
+
 def _until_it_is(process: subprocess.Popen[Any], state: str) -> None:
-    """``state``: proc_pid_stat(5), of its main thread."""
-    stat = Path(f"/proc/{process.pid}/task/{process.pid}/stat")
-    until(lambda: stat.read_text(encoding="utf-8").rpartition(")")[2].split()[0] == state, f"state {state}")
+    """``state`` of its main thread."""
+    until(lambda: _state(Path(f"/proc/{process.pid}/task/{process.pid}")) == state, f"state {state}")
 
 
 def signal_another_thread(process: subprocess.Popen[Any], number: signal.Signals) -> None:

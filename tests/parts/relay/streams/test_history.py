@@ -15,6 +15,7 @@ import zenoh
 from zenoh import ext
 
 from support.sessions import matches
+from support.signals import stand_still
 from support.waiting import free_endpoint, until
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import StreamClass, StreamSettings
@@ -135,7 +136,7 @@ def test_a_publisher_that_stood_still_while_it_was_asked_is_asked_again(
         until(lambda: any(net.relay.liveliness().get(f"{KEY}/@adv/**")), "the publisher's token")
         ask = partial(net.relay.get, f"{KEY}/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY)
         until(lambda: any(ask()), "its cache: a question for what is not known yet is sent to nobody")
-        process.send_signal(signal.SIGSTOP)
+        stand_still(process)
         net.receive()
         until(lambda: unanswered and not under_way, "every question so far has ended without an answer")
         assert not net.got
