@@ -288,10 +288,10 @@ def observe(report: Report) -> None:
     bash = ["bash", "-c", f". {SHARE}/bash-completion/completions/zsched; complete -p zsched"]
     report["completion"] = run(*bash).stdout.strip()
     begin_fleet(report)
-    report["users"] = users_of("zsched.tasks.echo")
     report["first"] = status_of(ROBOT_SOCKET).get("version")
     members(report)
     report["upgrade"] = changed("new")
+    report["users"] = users_of("zsched.tasks.echo")
     report["downgrade"] = changed("old")
     report["remove"] = removed()
     if not BY_PIP:
