@@ -162,7 +162,6 @@ def the_tour(port: int) -> list[Step]:
         "record -o run.mcap --for 3s",
         "trace --help",
         "init --example python my-task",
-        "man manual",
         "recover --plan",
         "rejoin --help",
         "invite robot4 --address 127.0.0.1:" + str(port + PER_NODE * len(NODES)) + " --plan",
