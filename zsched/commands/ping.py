@@ -24,9 +24,7 @@ from zsched.core.values.snapshot import Snapshot
 from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
-from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import asker_in, session_text
-from zsched.sessions import config as zenoh_config
+from zsched.runtime.tls import asker_in, visits
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
 
@@ -92,7 +90,7 @@ def ping_node(
 
 def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
     """The node's own addresses, measured at the same time."""
-    spec, keys, text = fleet.node(question.node), Keyspace(fleet.name), session_text(fleet, Side.VISIT)
+    spec, keys = fleet.node(question.node), Keyspace(fleet.name)
     selectors = {CONTROL: keys.status(spec.name, asker_in(fleet, me)), DATA: keys.role(spec.name, "*")}
     dialled = [
         (name, endpoint, large)
@@ -100,10 +98,10 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
         for large in (SIZES if name == DATA else ("",))
         if endpoint
     ]
+    configs = visits(fleet, (endpoint for _, endpoint, _ in dialled))
 
-    def measured(one: tuple[str, str, str]) -> Way:
+    def measured(one: tuple[str, str, str], config: str) -> Way:
         name, endpoint, large = one
-        config = zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
         found = ping(
             config,
             selectors[name],
@@ -117,7 +115,7 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
 
     pool = ThreadPoolExecutor(max_workers=len(dialled) or 1)
     try:
-        yield from pool.map(measured, dialled)
+        yield from pool.map(measured, dialled, configs)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)  # Ctrl-C waits for no answer
 

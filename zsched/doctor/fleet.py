@@ -32,9 +32,7 @@ from zsched.doctor.model import (
 )
 from zsched.doctor.network import Address, addresses, connected
 from zsched.errors import ConfigError
-from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import session_text
-from zsched.sessions.config import client_config
+from zsched.runtime.tls import visits
 from zsched.wire.keyspace import Keyspace
 
 T = TypeVar("T")
@@ -71,20 +69,19 @@ def _small_only(scene: Scene, living: list[Address]) -> Iterator[Result]:
     """A result for each data session that is asked in vain with a large question."""
     keys = Keyspace(scene.fleet.name)
     try:
-        text = session_text(scene.fleet, Side.VISIT)
+        configs = visits(scene.fleet, (address.endpoint for address in living))
     except (ConfigError, ValueError):
         return  # a check of its own says what is wrong with that file
 
-    def lost(address: Address) -> str:
+    def lost(address: Address, config: str) -> str:
         selector = keys.role(address.node, "*")
-        config = client_config(connect=(address.endpoint,), timing=scene.fleet.timing, operator_json5=text)
         for name, size in SIZES.items():
             if ping(config, selector, count=1, timeout_s=LARGE_S, interval_s=0, needs_answer=False, size=size).missed:
                 return name or "1 KiB"
         return ""
 
     with ThreadPoolExecutor(max_workers=16) as pool:
-        for address, size in zip(living, pool.map(lost, living), strict=True):
+        for address, size in zip(living, pool.map(lost, living, configs), strict=True):
             if size:
                 fix = "a link in between loses large packets: give both machines' interfaces the smaller MTU (ip link)"
                 yield failed(f"{address} takes no {size} from here", fix=fix)

@@ -29,10 +29,8 @@ from zsched.doctor.fleet import differs
 from zsched.doctor.model import Json, Scene
 from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.ipc.takeover import Door
-from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import asker_in, session_text
+from zsched.runtime.tls import asker_in, visits
 from zsched.runtime.zenoh_file import judged
-from zsched.sessions import config as zenoh_config
 from zsched.wire.codec import from_plain
 
 ASK_S: Final = 5.0
@@ -195,11 +193,7 @@ def _through(door: Path, node: NodeId) -> tuple[Json | None, float]:
 def _directly(fleet: Fleet, asker: NodeId, missing: list[NodeId]) -> list[Json]:
     endpoints = [spec.control_at for spec in fleet.nodes if spec.name in missing and spec.control_at]
     try:
-        text, asker = session_text(fleet, Side.VISIT), asker_in(fleet, asker)
-        configs = [
-            zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
-            for endpoint in endpoints
-        ]
+        configs, asker = visits(fleet, endpoints), asker_in(fleet, asker)
     except (ConfigError, ValueError):
         return []  # a check of its own says what is wrong with that file
     return [snapshot_json(answer) for answer in ask_fleet(fleet.name, asker, configs)]

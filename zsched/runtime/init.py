@@ -20,10 +20,8 @@ from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.core.vote.generations import blank_state, objection
 from zsched.errors import AdapterError
-from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import asker_in, protocol_of, session_text
+from zsched.runtime.tls import asker_in, protocol_of, visits
 from zsched.runtime.zenoh_file import operator_json5
-from zsched.sessions import config as zenoh_config
 
 
 class Heard(Struct, frozen=True, kw_only=True):
@@ -156,13 +154,8 @@ def ask_others(fleet: Fleet, node: NodeId) -> Heard:
     """Ask every other node that has an address for its status."""
     others = [spec for spec in fleet.nodes if spec.name != node and spec.listen_control]
     endpoints = tuple(spec.control_at for spec in others if spec.control_at)
-    text = session_text(fleet, Side.VISIT)
     protocol_of(fleet, operator_json5(fleet))  # with TLS that cannot work nobody would answer
-    configs = [
-        zenoh_config.client_config(connect=(endpoint,), timing=fleet.timing, operator_json5=text)
-        for endpoint in endpoints
-    ]
-    answers = ask_fleet(fleet.name, asker_in(fleet, node), configs)
+    answers = ask_fleet(fleet.name, asker_in(fleet, node), visits(fleet, endpoints))
     return Heard(asked=len(endpoints), answers=tuple(answer for answer in answers if answer.node != node))
 
 

@@ -38,6 +38,17 @@ def session_text(fleet: Fleet, side: Side, env: Mapping[str, str] = os.environ, 
     return text if fleet.security is None else secured_text(fleet, fleet.security, side, text, env, home)
 
 
+def visits(fleet: Fleet, endpoints: Iterable[str]) -> list[str]:
+    """The configuration of a client session to each of these addresses, for a tool that asks a moment.
+
+    Raises:
+        ConfigError: as `session_text`.
+        ValueError: the operator's file is no zenoh configuration.
+    """
+    text = session_text(fleet, Side.VISIT)
+    return [zenoh_config.client_config(connect=(one,), timing=fleet.timing, operator_json5=text) for one in endpoints]
+
+
 def asker_in(fleet: Fleet, name: str) -> str:
     """In whose name a tool asks: a secured fleet takes questions only in that of the certificate.
 
