@@ -178,6 +178,10 @@ def test_a_user_whom_nobody_starts_workers_for_is_told_with_the_command(report: 
     assert "sudo systemctl enable --now zsched-worker@ghost.socket" in report["ghost"]["reason"]
 
 
+def test_a_starter_that_cannot_start_is_tried_at_leisure(report: dict[str, Any]) -> None:
+    assert 1 <= report["failed_starts"] <= 4
+
+
 def test_it_is_stopped_when_its_task_moves_and_killed_where_it_will_not(report: dict[str, Any]) -> None:
     assert report["ended"], report["moved"]
     assert report["killed"], report["restarted"]

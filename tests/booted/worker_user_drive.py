@@ -9,7 +9,9 @@ import json
 import os
 import pwd
 import signal
+import socket
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -71,12 +73,23 @@ def begin(report: Report) -> None:
     edge = ["--config", FLEET, "--node", "edge1", "--state-dir", str(EDGE / "state")]
     report["init"] = [said(ZSCHED, "init", "--config", FLEET, "--node", "robot1"), said(ZSCHED, "init", *edge)]
     run("systemctl", "enable", "--now", "zsched-worker@ros.socket")
+    report["failed_starts"] = starts_of_nobody(2.0)
     report["start"] = said("systemctl", "start", "zsched.service")
     command = ["systemd-run", "--unit=edge1", "--service-type=exec", "-p", "KillMode=mixed", ZSCHED, "up", *edge]
     report["start_edge"] = said(*command, "--runtime-dir", str(EDGE / "run"))
     wait_for(lambda: is_settled(ROBOT_SOCKET), 60.0, "somebody owns the task")
     run(ZSCHED, "move", "echo", "robot1", "--yes")
     wait_for(lambda: is_settled(ROBOT_SOCKET, "robot1"), 60.0, "robot1 owns the task")
+
+
+def starts_of_nobody(seconds: float) -> int:
+    """How often systemd tries in this time to start who has been asked for, as a user that is not there."""
+    run("systemctl", "start", "zsched-worker@nobody-there.socket")
+    with socket.socket(socket.AF_UNIX) as link:
+        link.connect("/run/zsched-workers/nobody-there.sock")
+    time.sleep(seconds)
+    run("systemctl", "stop", "zsched-worker@nobody-there.socket")
+    return run("journalctl", "-u", "zsched-worker@nobody-there.service").stdout.count("Failed with result")
 
 
 def observe(report: Report) -> None:
@@ -110,9 +123,12 @@ def observe(report: Report) -> None:
     wait_for(lambda: is_settled(ROBOT_SOCKET), 60.0, "somebody owns the task")
     run(ZSCHED, "move", "echo", "robot1", "--yes")
     report["as_daemon"] = holds(lambda: is_settled(ROBOT_SOCKET, "robot1")) and workers()
-    run("systemctl", "stop", "zsched.service", "zsched-worker@*")
+    for pid in processes("workers.starter"):
+        os.kill(pid, signal.SIGSTOP)
+    run("systemctl", "stop", "zsched.service")
+    report["left"] = holds(lambda: not processes(), 5.0) or processes()
+    run("systemctl", "stop", "zsched-worker@*")
     report["run"] = sorted(str(path) for path in Path("/run").glob("zsched*"))
-    report["left"] = holds(lambda: not processes(), 5.0) or {pid: run("ps", str(pid)).stdout for pid in processes()}
 
 
 def observe_secured(report: Report) -> None:
