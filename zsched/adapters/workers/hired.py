@@ -115,14 +115,12 @@ class Hired:
             self._status = int(rest) if word == "exit" else -signal.SIGKILL
 
     def _line(self) -> str:
-        """The starter's next line; empty once it has gone."""
-        while b"\n" not in self._said:
-            try:
-                more = self._link.recv(4096)
-            except ConnectionError:
-                more = b""
-            if not more:
-                return ""
-            self._said += more
+        """The starter's next line, which comes as a whole; empty once it has gone.
+
+        It is as good as its workers, who may do with it what they like: it is waited for once, whatever it says.
+        """
+        if b"\n" not in self._said:
+            with contextlib.suppress(ConnectionError):
+                self._said += self._link.recv(4096)
         line, _, self._said = self._said.partition(b"\n")
         return line.decode(errors="replace")

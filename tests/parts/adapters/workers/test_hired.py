@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
 import socket
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -139,6 +141,40 @@ def test_it_dies_with_its_daemon_and_with_its_starter(tmp_path: Path) -> None:
                 link.close()
         path.unlink()
         (tmp_path / "own").rmdir()
+
+
+@pytest.mark.parametrize("greeting", [b"", b"pid 1\n"])
+def test_a_starter_that_babbles_holds_nobody_up(tmp_path: Path, greeting: bytes) -> None:
+    """Its workers have its user, and may have taken it over."""
+    is_over, path = threading.Event(), tmp_path / "other.sock"
+
+    def babble(listener: socket.socket) -> None:
+        link, _ = listener.accept()
+        with link, contextlib.suppress(OSError):
+            link.sendall(greeting)
+            while not is_over.is_set():
+                link.sendall(b"." * 4096)
+
+    timer = threading.Timer(5.0, is_over.set)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        thread = threading.Thread(target=babble, args=(listener,))
+        thread.start()
+        timer.start()
+        try:
+            if greeting:
+                link = Hired(path, ("true",), {}, "")
+                until(link.has_exited, "it counts as ended")
+                link.close()
+            else:
+                with pytest.raises(AdapterError, match="it refuses this daemon"):
+                    Hired(path, ("true",), {}, "")
+            assert not is_over.is_set()
+        finally:
+            is_over.set()
+            timer.cancel()
+            thread.join(timeout=10.0)
 
 
 def test_a_stranger_starts_nothing(tmp_path: Path) -> None:
