@@ -293,6 +293,8 @@ def observe(report: Report) -> None:
     report["upgrade"] = changed("new")
     report["users"] = users_of("zsched.tasks.echo")
     report["downgrade"] = changed("old")
+    if BY_PIP:
+        put("new")  # whose `uninstall` knows all that was made
     report["remove"] = removed()
     if not BY_PIP:
         report["back"] = comes_back()
