@@ -210,7 +210,7 @@ class WorkerSpec:
         "where absences before, less a tenth of the time between them, come to more than it.",
         SECONDS,
     )
-    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL; at the daemon's own end 0.35 s.", SECONDS)
+    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL, but for the daemon's own end.", SECONDS)
     output_deadline_s: float | None = key(
         None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="by the task's rhythm"
     )
@@ -298,7 +298,7 @@ class TaskSpec:
     on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
     exclusive: bool = key(
         False,
-        "The work must never run twice; needs `{epoch}` in every output's `from`. "
+        "Only an owner with a lease works; needs `{epoch}` in every output's `from`. "
         "A task that has worked without it rests until all its candidates have answered by this file.",
     )
     drain_s: float = key(2.0, "How long the old owner may finish what it has in work.", Range(0, 600, "s"))
