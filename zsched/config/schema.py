@@ -401,7 +401,7 @@ SECURITY: Final = Record(
         "signatures": Field(
             Choice.of(Signatures),
             "Signatures on votes, learnt values and commands: a frame without one is dropped (`required`), or taken "
-            "while nodes of an older version are in the fleet (`offered`); `off`: nobody signs.",
+            "while some nodes do not sign yet (`offered`); `off`: nobody signs.",
             default="`required`",
         ),
     },

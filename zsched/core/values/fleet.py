@@ -426,7 +426,7 @@ class Signatures(StrEnum):
     """What a secured fleet does with signatures on votes, learnt values and commands."""
 
     REQUIRED = "required"  # a frame without a right one is dropped
-    OFFERED = "offered"  # one that is there must be right; while nodes of an older version are in the fleet
+    OFFERED = "offered"  # one that is there must be right; while some nodes do not sign yet
     OFF = "off"  # nobody signs, and nobody looks
 
 
