@@ -294,7 +294,7 @@ def observe(report: Report) -> None:
     report["users"] = users_of("zsched.tasks.echo")
     report["downgrade"] = changed("old")
     if BY_PIP:
-        put("new")  # whose `uninstall` knows all that was made
+        changed("new")  # whose `uninstall` knows all that was made
     report["remove"] = removed()
     if not BY_PIP:
         report["back"] = comes_back()
