@@ -3,14 +3,21 @@
 ``python -m benchmarks.house [CHECKOUT ...]``: a column for each checkout; none given: this one. A room of a package is
 a folder or a module directly in it; an arrow is an import from one room into another, counted once; the floors are the
 rooms on the longest way along arrows, where rooms that import each other stand on one floor. The lab counts apart.
+
+``python -m benchmarks.house --budget``: each room's lines of code (without blanks, comments and docstrings) and the
+other figures that have a budget, beside `benchmarks/budget.toml`. ``--lower`` writes today's figures there where they
+are lower; none is ever raised by it. `tests/unit/test_budget.py` fails above the budget.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import io
 import re
 import statistics
+import tokenize
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +25,10 @@ from typing import Final
 
 HERE: Final = Path(__file__).parents[1]
 GENERATED: Final = "_version.py"
+BUDGET: Final = HERE / "benchmarks" / "budget.toml"
+LARGE_CLASS: Final = 300
+_NO_CODE: Final = frozenset({tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT})
+_NO_CODE_EITHER: Final = frozenset({tokenize.ENCODING, tokenize.ENDMARKER})
 
 Graph = Mapping[str, frozenset[str]]
 
@@ -116,6 +127,71 @@ def functions_of(files: list[Path]) -> list[int]:
     )
 
 
+def code_lines(text: str) -> int:
+    """Lines with code: no blanks, comments or docstrings; a statement over three lines is three."""
+    lines: set[int] = set()
+    told = {
+        node.lineno
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    }
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        is_docstring = token.type == tokenize.STRING and token.start[0] in told
+        if token.type not in _NO_CODE | _NO_CODE_EITHER and not is_docstring:
+            lines.update(range(token.start[0], token.end[0] + 1))
+    return len(lines)
+
+
+def room_lines(root: Path) -> dict[str, int]:
+    """{room: its lines of code} of a checkout; rooms of the core apart, a package's loose modules under its name."""
+    found: dict[str, int] = {}
+    for file in sources(root / "zsched"):
+        parts = file.relative_to(root).parts
+        depth = 3 if len(parts) > 3 and parts[1] == "core" else min(2, len(parts) - 1)
+        room = "/".join(parts[:depth])
+        found[room] = found.get(room, 0) + code_lines(file.read_text(encoding="utf-8"))
+    return dict(sorted(found.items()))
+
+
+def large_classes(files: list[Path]) -> int:
+    """Classes of over `LARGE_CLASS` lines."""
+    return sum(
+        node.end_lineno - node.lineno + 1 > LARGE_CLASS
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef) and node.end_lineno is not None
+    )
+
+
+def spent(root: Path) -> dict[str, int]:
+    """What a checkout has of each figure that has a budget."""
+    package = root / "zsched"
+    rooms = room_lines(root)
+    figures = {f"lines of code, {room}/": lines for room, lines in rooms.items()}
+    figures["lines of code, all of zsched/"] = sum(rooms.values())
+    figures["classes over 300 lines"] = large_classes(sources(package))
+    for name in ("zsched", "zsched.core", "zsched.commands"):
+        figures[f"arrows of {name}"] = shape_of(graph_of(root.joinpath(*name.split(".")), name)).arrows
+    figures["words of documents"] = words_of(root)
+    return figures
+
+
+def budget() -> dict[str, int]:
+    """What each figure may be at most."""
+    return {str(name): int(most) for name, most in tomllib.loads(BUDGET.read_text(encoding="utf-8")).items()}
+
+
+def show_budget(*, lower: bool) -> None:
+    """Print each figure beside its budget; ``lower``: a budget that is above its figure becomes that."""
+    now, most = spent(HERE), budget()
+    for name in sorted({*now, *most}):
+        print(f"{now.get(name, 0):7d} of {most.get(name, 0):7d}  {name}")
+    if lower:
+        head = BUDGET.read_text(encoding="utf-8").partition("\n\n")[0]
+        rows = [f'"{name}" = {min(figure, most.get(name, figure))}' for name, figure in now.items()]
+        BUDGET.write_text("\n".join((head, "", *rows, "")), encoding="utf-8")
+
+
 def words_of(root: Path) -> int:
     """Words of the documents: everything between white space that holds a letter."""
     files = [*root.glob("*.md"), *root.glob("docs/**/*.md")]
@@ -154,10 +230,16 @@ def _loose(package: Path) -> int:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table, or the budget."""
     parser = argparse.ArgumentParser(description="size and shape of the code", prog="python -m benchmarks.house")
     parser.add_argument("checkout", nargs="*", type=Path, help="folders of checkouts; none: this one")
-    checkouts: list[Path] = parser.parse_args().checkout or [HERE]
+    parser.add_argument("--budget", action="store_true", help="this checkout beside its budget")
+    parser.add_argument("--lower", action="store_true", help="the same, and write what has become less")
+    given = parser.parse_args()
+    if given.budget or given.lower:
+        show_budget(lower=given.lower)
+        return
+    checkouts: list[Path] = given.checkout or [HERE]
     for root in checkouts:
         if not (root / "zsched" / "core").is_dir():
             parser.error(f"{root} is no checkout of zsched: there is no zsched/core in it")
