@@ -43,7 +43,8 @@ pytestmark = [pytest.mark.root, pytest.mark.timeout(60)]
 def starting(tmp_path: Path, asker: int = 0) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
     """A starter's socket, and its process: of another user, for orders of the user ``asker``."""
     code, folder, path = tmp_path / "code", tmp_path / "own", tmp_path / "other.sock"
-    for one in (tmp_path, *tmp_path.parents[:2]):
+    below = tmp_path.parts.index(next(part for part in tmp_path.parts if part.startswith("pytest-of-")))
+    for one in (tmp_path, *tmp_path.parents[: len(tmp_path.parts) - below - 1]):  # one more beside other workers
         one.chmod(0o755)
     for name in ("__init__.py", "adapters/__init__.py", "adapters/workers/__init__.py"):
         (code / "zsched" / name).parent.mkdir(parents=True, exist_ok=True)
