@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.commit [--n 200] [--robots 3] [--edges 3] [--period 1.0]``. Real daemons on loopback, each with
 its relay, and with its worker on edges. Every robot's link to the edges follows a synthetic recording in which the
-best edge changes every period; with patience, bonus and cool-down at 0, and nothing foreseen, each change is a vote.
+best edge changes every period; with price and bonus at 0 each change is a vote.
 Times are read from the daemons' own logs (one host, one clock, whole milliseconds). The last line says how much of all
 cores the machine used meanwhile: near 100 % the figures are of the cores, not of zsched.
 """
@@ -47,9 +47,8 @@ def fleet(folder: Path, robots: int, edges: int, period_s: float) -> dict[str, A
     tree = echo_fleet(
         robots=robots,
         edges=edges,
-        scheduling={"patience": 0, "bonus": 0, "cool_down_s": 0, "max_moves_per_minute": 1000},
+        scheduling={"price_s": 0, "bonus": 0},
         weights={"cpu": 0.0, "memory": 0.0, "network": 1.0},
-        task={"link": {"foresee_s": 0}},  # a signal that jumps every second has no trend to be foreseen
     )
     tree["timing"] = {"profile": "wifi", "smoothing_s": 0.2}
     for name, node in tree["nodes"].items():

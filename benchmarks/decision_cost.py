@@ -56,7 +56,6 @@ class Round:
             candidates=edges,
             tuning=tuning,
             demand=Demand(cpu_cores=0.4, memory_mb=250.0),
-            learns_patience=True,
         )
         nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in edges]
         nodes += [NodeSpec(name=name, kind=NodeKind.ROBOT) for name in names]
@@ -120,9 +119,7 @@ def measure(candidates: int, robots: int, repeat: int, tuning: Tuning) -> tuple[
     standing = compare(task, allocation, vectors)
 
     def judge() -> None:
-        Judge(spec=task).judge(
-            standing, allocation, settled_for_s=99.0, escape=None, is_called=False, now=one.now, damping=None
-        )
+        Judge(spec=task).judge(standing, allocation, escape=None, is_called=False, now=one.now, damping=None)
 
     return (
         milliseconds(one.own, repeat),

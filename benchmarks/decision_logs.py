@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.decision_logs [--minutes 60] [--robots 3] [--edges 2] [--timing wifi] [--seed 1] [--out DIR]``.
 Robots and edges on loopback, each edge with a share of the CPU of its own, and two tasks: one by the paper's score, one
-by service with a learnt patience.
+by service.
 Every 5 to 25 s something happens, at random: a busy process in an edge's share, a daemon that is killed or stopped and
 started again, one that stands still for seconds, or an operator's order by the real command (move, pin, pause, tune,
 drain, and what ends them). Meanwhile every line of every node's decision log is copied before its
@@ -53,7 +53,6 @@ def fleet(robots: int, edges: int, timing: str) -> Json:
     tree["tasks"][SERVICE] = {
         "candidates": first["candidates"],
         "weights": first["weights"],
-        "scheduling": {"max_moves_per_minute": 1000},
         "demand": {"cpu_cores": 0.2},
         "worker": first["worker"],
         "inputs": [{"from": "{robot}/in2", "to": "{target}/service/{robot}/in"}],
@@ -166,7 +165,7 @@ class Disturbance:
                 ("pause", task, "--for", f"{choice.randint(5, 30)}s"),
                 ("resume", task),
                 ("tune", task, f"bonus={choice.choice([0.02, 0.1, 0.3])}"),
-                ("tune", task, f"patience={choice.choice(['null', '0.05', '0.3'])}"),
+                ("tune", task, f"price_s={choice.choice(['null', '0.05', '0.3'])}"),
                 ("tune", task, f"cpu={cpu}", f"memory={1 - cpu:.1f}", "network=0"),
                 ("drain", edge, "--detach", "--for", f"{choice.randint(10, 60)}s"),
                 ("undrain", edge),

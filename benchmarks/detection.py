@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.detection [--timing wired wifi] [--case killed worker frozen cut heal] [--n N] [--kills N]
 [--rest S] [--loss P] [--out FOLDER] [--table]``. Needs root: six daemons in network namespaces with echo workers and a
-cool-down of 0, an application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each
+price of 0, an application on robot1 that publishes at 200 Hz on its own key. Several timings run side by side, each
 with a fleet of its own. With ``--rest 6`` each fault meets a fleet at rest, whose beats are slow; with ``--loss 20``
 one whose links lose that many of 100 packets. With ``--out`` every cycle is on disk at once: the same command goes on
 where it was interrupted, ``--table`` only prints what is there.

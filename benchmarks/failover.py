@@ -1,7 +1,7 @@
 """Owner killed (its daemon, SIGKILL) -> first message through the new owner, as a robot's application sees it.
 
 ``python -m benchmarks.failover [--n 40] [--timing wifi|wired] [--robots 3] [--edges 3]``. Daemons on loopback with echo
-workers and a cool-down of 0; the application publishes at 200 Hz on its own key. Reported is the time from the kill to
+workers and a price of 0; the application publishes at 200 Hz on its own key. Reported is the time from the kill to
 the first echo of a message that was sent after it: detection, vote, commit, handover, and one round trip through the
 new worker.
 """

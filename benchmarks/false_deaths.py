@@ -80,7 +80,7 @@ def pass_time(bed: Netbed, seconds: float) -> None:
 def watch(record: Record, name: str, minutes: float) -> None:
     """Run what is missing of a case's time, and count in slices of a minute."""
     case = CASES[name]
-    tree = echo_fleet(timing=case.timing, scheduling={"patience": 0.5, "cool_down_s": 10})
+    tree = echo_fleet(timing=case.timing, scheduling={"price_s": 2})
     with tempfile.TemporaryDirectory() as folder, Netbed(Path(folder), tree) as bed:
         bed.init()
         bed.start()

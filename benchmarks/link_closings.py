@@ -101,7 +101,7 @@ def main() -> int:
     with contextlib.ExitStack() as stack:
         for name, tree in trees.items():
             folder = stack.enter_context(tempfile.TemporaryDirectory())
-            fleet = echo_fleet(timing=given.timing, scheduling={"patience": 0.5, "cool_down_s": 10})
+            fleet = echo_fleet(timing=given.timing, scheduling={"price_s": 2})
             beds[name] = bed = stack.enter_context(TreeBed(Path(folder), fleet))
             bed.tree = tree
             begin(bed, given.congestion)

@@ -22,7 +22,7 @@ tasks:
   second:
     candidates: {kind: edge}
     weights: {cpu: 0.5, memory: 0.5}
-    scheduling: {score: paper, cool_down_s: 0}
+    scheduling: {score: paper}
     worker: {command: [python, -m, zsched.tasks.echo]}
     inputs: [{from: "{robot}/in2", to: "{target}/second/{robot}/in"}]
     outputs: [{from: "{target}/second/{epoch}/{robot}/out", to: "{robot}/out2"}]

@@ -54,8 +54,8 @@ class Bed(Testbed):
 
 @pytest.fixture
 def bed(tmp_path: Path) -> Iterator[Bed]:
-    # An endless loop is load, too: by patience alone no task leaves it here.
-    calm = {"patience": 1000}
+    # An endless loop is load, too: by the price alone no task leaves it here.
+    calm = {"price_s": 1000}
     tree = echo_fleet(robots=2, edges=2, timing="wired", worker=("python", str(WORKER)), scheduling=calm)
     tree["electorate"] = sorted(tree["nodes"])
     tree["tasks"][TASK]["worker"] |= {"output_deadline_s": DEADLINE_S, "max_failures": 2, "start_deadline_s": 30}

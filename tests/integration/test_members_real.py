@@ -24,7 +24,7 @@ tasks:
   echo:
     candidates: {kind: robot}
     weights: {cpu: 0.5, memory: 0.5}
-    scheduling: {score: paper, cool_down_s: 0}
+    scheduling: {score: paper}
     worker: {command: [python, -m, zsched.tasks.echo]}
     inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in", class: reliable, on_crash: replay}]
     outputs:

@@ -15,6 +15,7 @@ from zsched.core.executor.handover import Executor, Phase
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, PublishProposal, StartWorker, StopWorker
 from zsched.core.profile.profile import Profiler
+from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.values.change import MoveOwner, Retune
 from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.model import Allocation, PeerState, Proposal
@@ -278,10 +279,11 @@ def test_the_task_follows_the_signal_from_robot_to_robot_by_consensus() -> None:
     assert [owner for _, owner in team.moves] == ["robot1"]
     assert team.value.epoch == 2
     # -45 dBm falls below -67 dBm, where the lead passes the bonus, after 1.3 time constants. From then on staying
-    # costs the lead at most, and half of it at least; the rest is a round.
+    # costs the lead at most, and half of it at least, and for the seconds ahead at once. It must cost a move, and half
+    # of one that the others owe; the rest is a round.
     waited = team.moves[0][0] - 20.0
     timing, lead = team.fleet.timing, (NEAR["robot1"] - FAR) / 40.0 - TUNING.bonus
-    assert SPEC.patience / lead <= waited <= 2.0 * SPEC.patience / lead + 1.3 * timing.smoothing_s + 0.75
+    assert 0.0 < waited <= max(3.0 * SPEC.price_s / lead - AHEAD_S, 0.0) + 1.5 * timing.smoothing_s + 0.75
 
 
 def test_the_first_proposal_makes_every_robot_run_its_round_at_once() -> None:

@@ -27,8 +27,8 @@ SLEW = ClockCompared(error_ratio=0.083, since_s=0.2)
 WELL = ClockCompared(error_ratio=1e-5, since_s=0.2)
 TASK = task_of(
     "guard",
-    tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-    patience=0.1,
+    tuning=tuning_of(cpu=1.0, memory=0.0),
+    price_s=0.1,
     worker=WorkerSpec(command=("true",)),
     exclusive=True,
 )
@@ -199,11 +199,11 @@ def test_nobody_is_sent_to_a_node_whose_clock_is_in_doubt() -> None:
     assert working(sim) == owner
 
 
-@pytest.mark.parametrize("hold", ["pin", "cool-down", "low battery"])
+@pytest.mark.parametrize("hold", ["pin", "low battery"])
 def test_nothing_that_waits_for_something_better_keeps_a_task_on_an_owner_whose_clock_is_in_doubt(hold: str) -> None:
     """It stood still for as long as the doubt lasted: only a planned move left it, and its margins still counted."""
     of = fleet("edge1", "edge2")
-    tuning = tuning_of(cpu=1.0, memory=0.0, cool_down_s=60.0 if hold == "cool-down" else 2.0, score=ScoreForm.SERVICE)
+    tuning = tuning_of(cpu=1.0, memory=0.0, score=ScoreForm.SERVICE)
     limits = (("battery", 0.2),) if hold == "low battery" else ()
     task = replace(of.tasks[0], tuning=tuning, gauge_limits=limits)
     charge = {"edge2": (("battery", 0.22),)} if limits else {}

@@ -28,8 +28,8 @@ def fleet(*, exclusive: bool = True, robots_only: bool = False) -> Fleet:
     task = task_of(
         TASK,
         edges or robots,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.1,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.1,
         worker=WorkerSpec(command=("true",)),
         exclusive=exclusive,
         max_moves_per_minute=1000,

@@ -24,8 +24,8 @@ OLD = fleet_of(
     task_of(
         TASK,
         EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.1,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.1,
         worker=WorkerSpec(command=("true",)),
     ),
     of=sorted(EDGES + ROBOTS),
@@ -158,7 +158,9 @@ def test_an_owner_that_takes_the_file_while_it_works_is_exclusive_once_its_worke
     rollout.sim.work.stop_s = (6.0,)
     rollout.reload(NEW, owner)
     for _ in range(5):
-        assert rollout.run(1.0) == 0.0
+        assert (
+            rollout.run(0.9) == 0.0
+        )  # `problems` must not meet a profile that is due: it drops what else is to be done
         assert f"({owner} has not said that its worker has stopped)" in rollout.problems(owner)
     rollout.run(3.0)
     assert rollout.at_work() == {rollout.owner()} == {rollout.sim.working[TASK][0]}

@@ -17,8 +17,8 @@ DEADLINE_S = 3.0
 def fleet() -> Simulator:
     task = task_of(
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.0,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.0,
         worker=WorkerSpec(ready_when=ReadyWhen.MATCHING, start_deadline_s=DEADLINE_S),
     )
     return Simulator(fleet=fleet_of(task, of=EDGES + ROBOTS), seed=3)

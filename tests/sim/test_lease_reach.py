@@ -13,9 +13,9 @@ from zsched_lab.sim.missed_electors import ELECTORS, ROBOTS, main, moves, play, 
 from zsched_lab.sim.simulator import Simulator
 
 
-def started(*, cool_down_s: float = 0.0, pinned: bool = False, electors: tuple[str, ...] = ELECTORS) -> Simulator:
+def started(*, pinned: bool = False, electors: tuple[str, ...] = ELECTORS) -> Simulator:
     """A fleet whose owner is edge1, and has been for a while."""
-    sim = missed_electors.started(cool_down_s=cool_down_s, electors=electors)
+    sim = missed_electors.started(electors=electors)
     if pinned:
         order = HoldTask(task="guard", hold=Hold.PIN, node="edge1", asked=Asked(by="ada@robot1"))
         sim.deliver(sim.machines["robot1"], HoldCommanded(request=1, command=order))
@@ -24,12 +24,12 @@ def started(*, cool_down_s: float = 0.0, pinned: bool = False, electors: tuple[s
     return sim
 
 
-@pytest.mark.parametrize("hold", ["", "pin", "cool-down"])
+@pytest.mark.parametrize("hold", ["", "pin"])
 @pytest.mark.parametrize("ways", ["both", "to it", "from it"])
 def test_the_task_is_left_once_a_majority_of_the_electors_and_its_owner_do_not_hear_each_other(
     hold: str, ways: str
 ) -> None:
-    sim = started(cool_down_s=60.0 if hold == "cool-down" else 0.0, pinned=hold == "pin")
+    sim = started(pinned=hold == "pin")
     pairs = [("edge1", name) for name in ELECTORS[:2]]
     if ways in ("both", "from it"):
         sim.cuts.update(pairs)
@@ -126,7 +126,7 @@ def test_an_owner_that_says_that_it_rests_is_left_for_one_that_has_not() -> None
 @pytest.mark.parametrize(("down_s", "of_s", "within_s"), [(6.0, 6.2, 40.0), (5.0, 6.0, 40.0), (2.0, 3.0, 75.0)])
 def test_so_is_one_that_rests_again_and_again_and_never_for_long(down_s: float, of_s: float, within_s: float) -> None:
     """Each lease took all back that had been said of it: 16, 30 and 60 % of the time were worked, for good."""
-    sim = started(cool_down_s=60.0)
+    sim = started()
     before, began_at, at_work = moves(sim), sim.now, list[str]()
     while sim.now - began_at < within_s + 40.0:
         sim.heal()

@@ -29,7 +29,7 @@ def of(*tasks: str, exclusive: bool = False) -> Fleet:
         candidates=("edge1", "edge2", "robot3"),
         exclusive=exclusive,
         max_moves_per_minute=1,
-        tuning=replace(FLEET.tasks[0].tuning, bonus=0.3, cool_down_s=60.0),
+        tuning=replace(FLEET.tasks[0].tuning, bonus=0.3),
     )
     return replace(FLEET, tasks=tuple(replace(first, name=name) for name in tasks))
 
@@ -45,13 +45,13 @@ def moves_to(play: Play, task: str, *nodes: NodeId) -> bool:
 
 
 @pytest.mark.parametrize("exclusive", [False, True])
-def test_a_drained_owner_hands_over_without_patience_and_cool_down_and_stays_out(exclusive: bool) -> None:
+def test_a_drained_owner_hands_over_without_owing_anything_and_stays_out(exclusive: bool) -> None:
     play = Play(fleet=of(TASK, exclusive=exclusive))
     play.adopt()
     first = owner(play)
     others = [name for name in ("edge1", "edge2", "robot3") if name != first]
     play.set_flags(drain(first))
-    assert moves_to(play, TASK, *others), "the bonus, the cool-down and the cap of one a minute do not hold it"
+    assert moves_to(play, TASK, *others), "the bonus, the price and the cap of one a minute do not hold it"
     second = owner(play)
     play.set_flags(drain(first), drain(second))
     (third,) = (name for name in others if name != second)

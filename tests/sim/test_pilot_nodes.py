@@ -27,7 +27,7 @@ def fleet(electors: tuple[NodeId, ...], robots: tuple[NodeId, ...] = ROBOTS) -> 
     task = task_of(
         TASK,
         (*EDGES, *robots),
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         worker=WorkerSpec(command=("true",)),
         exclusive=True,
     )

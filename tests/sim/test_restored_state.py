@@ -23,8 +23,8 @@ FLEET = fleet_of(
     task_of(
         TASK,
         EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.05,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.05,
         worker=WorkerSpec(command=("true",)),
         exclusive=True,
         max_moves_per_minute=1000,

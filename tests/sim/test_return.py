@@ -16,8 +16,8 @@ def settled_on_edge1() -> Simulator:
     """A fleet at rest whose task would go to edge1 whenever it may."""
     task = task_of(
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.0,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.0,
         worker=WorkerSpec(command=("true",)),
     )
     fleet = fleet_of(task, of=EDGES + ROBOTS)

@@ -41,8 +41,8 @@ def fleet(words: list[str]) -> Fleet:
     task = task_of(
         TASK,
         edges,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.1,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.1,
         worker=WorkerSpec(command=("work",)),
         exclusive="exclusive" in words,
         drain_s=0.2,

@@ -9,20 +9,21 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.values.fleet import PAPER_PATIENCE, Fleet, Timing, WorkerSpec
+from zsched.core.scheduler.ledger import left_after_s
+from zsched.core.values.fleet import Fleet, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, PeerState
 from zsched_lab.sim.simulator import CORES, Simulator
 
 TASK = "merge"
 
 
-def fleet(robots: int = 3, edges: int = 3, *, patience: float = PAPER_PATIENCE, cool_down: float = 10.0) -> Fleet:
+def fleet(robots: int = 3, edges: int = 3, *, price_s: float = 0.3) -> Fleet:
     names = [f"robot{i}" for i in range(1, robots + 1)] + [f"edge{i}" for i in range(1, edges + 1)]
     task = task_of(
         TASK,
         tuple(f"edge{i}" for i in range(1, edges + 1)),
-        tuning=tuning_of(cool_down_s=cool_down),
-        patience=patience,
+        tuning=tuning_of(),
+        price_s=price_s,
         worker=WorkerSpec(command=("true",)),
     )
     return fleet_of(task, of=sorted(names))
@@ -70,11 +71,12 @@ def test_killed_owner_is_replaced_within_200_ms_and_epochs_rise_by_one(seed: int
     assert max(epoch for _, epoch in sim.owners) == 2
 
 
-def test_busy_owner_is_left_once_staying_has_cost_the_patience_and_not_before() -> None:
+@pytest.mark.parametrize("step", [0.3, 0.6])
+def test_busy_owner_is_left_once_staying_has_cost_a_move_and_not_before(step: float) -> None:
     """By a step of load of 0.6 the owner falls 0.3 behind: 0.2 with its bonus."""
     busy: set[NodeId] = set()
     sim = Simulator(
-        fleet=fleet(cool_down=0.0), seed=3, load=lambda node, _: (CORES * (0.85 if node in busy else 0.25), 1000.0)
+        fleet=fleet(), seed=3, load=lambda node, _: (CORES * (0.25 + step if node in busy else 0.25), 1000.0)
     )
     sim.start()
     assert sim.run_until(lambda: settled(sim), 15)
@@ -84,7 +86,8 @@ def test_busy_owner_is_left_once_staying_has_cost_the_patience_and_not_before() 
     busy.add(owner)
     at = sim.now
     assert sim.run_until(lambda: sim.agreed(TASK) not in (None, owner), 10)
-    due_s, timing = PAPER_PATIENCE / 0.2, Timing()
+    timing = Timing()
+    due_s = left_after_s(0.5 * step - 0.1, 0.3, timing.smoothing_s)
     assert due_s - timing.decide_s < sim.now - at < due_s + 2 * timing.smoothing_s + timing.decide_s
 
 
@@ -138,7 +141,7 @@ def test_late_node_learns_from_beats() -> None:
 
 def test_partial_cut_is_suspicion_for_one_and_an_ordinary_vote_for_all() -> None:
     """robot1 and the owner do not hear each other, everybody else hears both: never gone, but an edge that all robots
-    reach is better by robot1's share, and gets the task once staying has cost the patience."""
+    reach is better by robot1's share, and gets the task once staying has cost a move."""
     sim = started(7)
     owner = sim.agreed(TASK) or ""
     sim.run(12)
@@ -165,7 +168,7 @@ def test_random_faults_never_break_agreement_and_end_in_an_owner(seed: int) -> N
     """Loss, crashes, restarts, cuts, then quiet: one value per revision all along, a living owner at the end."""
     rng = Random(1000 + seed)
     sim = Simulator(
-        fleet=fleet(patience=0.1, cool_down=1.0),
+        fleet=fleet(price_s=0.1),
         seed=seed,
         loss=rng.choice([0.0, 0.05, 0.2]),
         delay_s=(0.0005, rng.choice([0.003, 0.2])),
@@ -210,7 +213,7 @@ def test_epochs_of_one_fleet_are_gapless_for_planned_moves() -> None:
 
 def limited(*limits: tuple[str, float], charge: dict[NodeId, float]) -> Simulator:
     """A fleet whose machines have these batteries; the test changes them."""
-    whole = fleet(cool_down=2.0)
+    whole = fleet()
     task = replace(whole.tasks[0], gauge_limits=limits)
     sim = Simulator(
         fleet=replace(whole, tasks=(task,)),

@@ -10,7 +10,7 @@ from zsched.core import status
 from zsched_lab.sim.faults import play
 from zsched_lab.sim.swarm import plan
 
-WITHOUT_A_STATE = 9000013
+WITHOUT_A_STATE = 9000028
 """A seed at whose end an elector has no state, and enough others have theirs."""
 
 

@@ -25,7 +25,7 @@ def end_streams(sim: Simulator) -> None:
 
 def played(down_s: float, of_s: float, for_s: float) -> tuple[list[str], int]:
     """Who has worked, each 0.1 s, and the moves, where the owner's streams are cut for ``down_s`` of each ``of_s``."""
-    sim = missed_electors.started(cool_down_s=60.0)
+    sim = missed_electors.started()
     sim.run(5.0)
     before, began_at, at_work, was_down = moves(sim), sim.now, list[str](), False
     while sim.now - began_at < for_s:
@@ -63,7 +63,7 @@ def test_the_only_robot_does_its_task_itself_where_no_stream_reaches_the_edge(
         candidates=("robot1", "edge1"),
         tuning=tuning_of(cpu=1.0, memory=0.0),
         worker=WorkerSpec(command=("work",)),
-        patience=0.15,
+        price_s=0.15,
     )
     fleet = fleet_of(task, of=(*robots, "edge1"))
     busy = {"robot1": 2.4}

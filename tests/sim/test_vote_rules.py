@@ -58,8 +58,8 @@ def reaching_all(robots: int) -> Simulator:
     voters, edges = tuple(f"robot{i}" for i in range(1, robots + 1)), ("edge1", "edge2", "edge3")
     task = task_of(
         candidates=edges,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
-        patience=0.0,
+        tuning=tuning_of(cpu=1.0, memory=0.0),
+        price_s=0.0,
         worker=WorkerSpec(command=("true",)),
         reach=Reach.ALL,
     )

@@ -16,7 +16,7 @@ FLEET = fleet_of(
     TaskSpec(
         name=TASK,
         candidates=EDGES,
-        tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0),
+        tuning=tuning_of(cpu=1.0, memory=0.0),
         worker=WorkerSpec(command=("true",)),
         exclusive=True,
     ),

@@ -49,9 +49,7 @@ from zsched.wire import codec as wire
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 NAMES = (*ROBOTS, *EDGES, "ghost")
 TASKS = ("alone", "cold", "merge", "other")
-TUNINGS = tuple(
-    Tuning(weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0), cool_down_s=0.0) for cpu in (0.25, 0.75)
-)
+TUNINGS = tuple(Tuning(weights=Weights(cpu=cpu, memory=1.0 - cpu, network=0.0)) for cpu in (0.25, 0.75))
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/{task}", to_template="{target}/{task}/{robot}/map")
 OTHER_RULE = StreamRule(
     direction=Direction.OUTPUT, from_template="{target}/{task}/{robot}/{epoch}", to_template="{robot}/{task}/answer"
@@ -63,7 +61,7 @@ def task(name: str, candidates: tuple[str, ...], *, standby: Standby, exclusive:
         name=name,
         candidates=candidates,
         tuning=TUNINGS[0],
-        patience=0.02,
+        price_s=0.02,
         worker=WorkerSpec(command=("work",), standby=standby, start_deadline_s=1.0, output_deadline_s=0.1),
         rules=(RULE,),
         exclusive=exclusive,

@@ -31,7 +31,7 @@ tasks:
   echo:
     candidates: [{FIRST}]
     weights: {{cpu: 0.5, memory: 0.5}}
-    scheduling: {{score: paper, cool_down_s: 0}}
+    scheduling: {{score: paper}}
     worker: {{command: [python, -m, zsched.tasks.echo]}}
     inputs: [{{from: "{{robot}}/in", to: "{{target}}/echo/{{robot}}/in"}}]
     outputs: [{{from: "{{target}}/echo/{{epoch}}/{{robot}}/out", to: "{{robot}}/out"}}]

@@ -35,7 +35,7 @@ def test_an_owner_that_gets_small_samples_only_is_a_problem_and_is_left(tmp_path
     reason = netns.why_not()
     if reason is not None:
         pytest.skip(f"no network namespaces here: {reason}")
-    tree = echo_fleet(robots=1, edges=2, timing="wired", scheduling={"patience": 1000})
+    tree = echo_fleet(robots=1, edges=2, timing="wired", scheduling={"price_s": 1000})
     with Netbed(tmp_path, tree) as bed:
         bed.init()
         bed.start()

@@ -368,8 +368,8 @@ def _tuning(page: Page, body: Json) -> None:
         ("sum" if tuning["score"] == "paper" else "product", ""),
         (str(tuning["aggregate"]), ""),
         (f"bonus {tuning['bonus']:g}", ""),
-        (f"staying has cost {body['spent']:.4f} of patience {body['patience']:g}", ""),
-        (f"owner known for {span(body['known_for_s'])}, cool-down {tuning['cool_down_s']:g}s", ""),
+        (f"a move costs {body['price_s']:g} s", ""),
+        (f"owner known for {span(body['known_for_s'])}", ""),
         *deadline,
     )
     if formula := formula_of(body):
@@ -445,14 +445,15 @@ def _sum(page: Page, body: Json, one: Json, indent: int) -> None:
     text, style = "", ""
     if one["joint"] is not None:
         text = f"{body['tuning']['aggregate']} {one['joint']:.4f}"
-        text += f" + bonus {one['bonus']:.4f}" if one["bonus"] else ""
-        text += f" - penalty {one['penalty']:.4f}" if one["penalty"] else ""
+        text += f" + bonus {one['bonus']:g}" if one["bonus"] else ""
+        text += f" - penalty {one['penalty']:g}" if one["penalty"] else ""
     if one["total"] is not None:
         text += f" = {one['total']:.4f}"
+    if one.get("owed_s") is not None:
+        text += f"; owes {max(one['owed_s'], 0.0):.2f} s"
     if one["why_not"]:
         text, style = f"{text}; {one['why_not']}" if text else one["why_not"], "red"
-    owner = "owner; " if one["is_owner"] else ""
-    tail = f"   ({owner}needs {need})" if need else f"   ({owner.rstrip('; ')})" if owner else ""
+    tail = f" (needs {need})" if need else " (owner)" if one["is_owner"] else ""
     page.row((f"{text}{tail}", page.width - indent - 1, style), indent=indent + 1)
 
 

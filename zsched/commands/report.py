@@ -408,13 +408,11 @@ def millis(seconds: float) -> str:
 def _scheduler(page: Page, status: Json, task: Json) -> None:
     tuning, decision = task["tuning"], task["decision"]
     weights = " ".join(f"{name} {value:g}" for name, value in shares(tuning["weights"]).items())
-    patience = task.get("patience")  # a later field of the schema's major version
     page.block(
         "SCHEDULER",
         (weights, ""),
         (f"bonus {tuning['bonus']:g}", ""),
-        *([(f"patience {patience:g}", "")] if patience is not None else []),
-        (f"cool-down {tuning['cool_down_s']:g}s", ""),
+        *([(f"a move costs {tuning['price_s']:g} s", "")] if tuning.get("price_s") is not None else []),
         *([(f"deadline {tuning['deadline_ms']:g} ms", "")] if tuning.get("deadline_ms") is not None else []),
         *([("by the paper's score", "")] if tuning.get("score") == "paper" else []),
     )

@@ -5,12 +5,10 @@ Knows: a task's settings, the fleet's timing. Does not know: the fleet file, nod
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE
-from zsched.core.scheduler.links import FORESEE_MOST_DB
-from zsched.core.scheduler.patience import CHOICES, FIRST_PATIENCE, spend
+from zsched.core.scheduler.ledger import AHEAD_S, left_after_s
 from zsched.core.scheduler.scoring import REACH_MARGIN_DB
 from zsched.core.scheduler.utility import NEARLY_FULL
 from zsched.core.values.deadline import tells_jobs
@@ -20,8 +18,6 @@ from zsched.core.values.model import PairReading, ScoreForm, Tuning
 
 LEADS = (0.5, 0.1)
 """The leads for which the report says how soon they are followed: a machine that is worth half, and a slight one."""
-STEP_S = 0.01
-LONGEST_S = 3600.0
 
 
 def told_once(specs: Iterable[TaskSpec], timing: Timing) -> list[list[str]]:
@@ -103,49 +99,25 @@ def _weighed(tuning: Tuning) -> Iterator[str]:
 def _when(spec: TaskSpec, timing: Timing) -> Iterator[str]:
     """When a lead is followed."""
     tuning = spec.tuning
-    seconds = "s of its work" if tuning.score is ScoreForm.SERVICE else "utility seconds"
-    if spec.learns_patience:
-        when = f"staying has cost its patience, which it learns ({CHOICES[0]:g} to {CHOICES[-1]:g} {seconds})"
-    elif spec.patience > 0.0:
-        when = f"staying has cost {spec.patience:g} {seconds} (patience)"
-    else:
-        when = "that is seen once (patience: 0)"
-    cost = "" if spec.patience <= 0.0 and not spec.learns_patience else "; a second costs the lead beyond the bonus"
-    yield f"it moves when another candidate leads by more than {tuning.bonus:g} (bonus) and {when}{cost}"
+    yield (
+        f"it moves to the machine that owes least once its own one owes {spec.price_s:g} s more (price_s): what it has "
+        f"lost there, half of it forgotten in {spec.memory_s:g} s (memory_s), and will lose in {AHEAD_S:g} s; what its "
+        f"own one is worth counts {tuning.bonus:g} more (bonus)"
+    )
     followed = "; ".join(f"by {lead:g} {_left(spec, timing, lead)}" for lead in LEADS)
     yield f"it leaves an owner that a load puts behind another candidate {followed}; {ON_TOP}"
 
 
 def _left(spec: TaskSpec, timing: Timing, lead: float) -> str:
     """How soon a lead is followed, in words."""
-    bonus = spec.tuning.bonus
-    if lead <= bonus:
+    if lead <= spec.tuning.bonus:
         return "never"
-    if not spec.learns_patience:
-        return f"after about {left_after_s(lead, bonus, spec.patience, timing):.2g} s"
-    first, least, most = (left_after_s(lead, bonus, one, timing) for one in (FIRST_PATIENCE, CHOICES[0], CHOICES[-1]))
-    return f"after about {first:.2g} s at first, {least:.2g} to {most:.2g} s by what it has learnt"
-
-
-def left_after_s(lead: float, bonus: float, patience: float, timing: Timing) -> float:
-    """Seconds from a step in the load to the proposal to leave, by a step that puts the owner behind by ``lead``.
-
-    Smoothing shows the step by and by, and what is seen is added up. That a robot looks once in a round only makes no
-    difference on average: what it sees, it charges for the whole round that has passed. An hour at most.
-    """
-    shown = spent = elapsed_s = 0.0
-    while (shown <= bonus or spent < patience) and elapsed_s < LONGEST_S:
-        elapsed_s += STEP_S
-        shown = lead * (1.0 - math.exp(-elapsed_s / timing.smoothing_s))
-        spent = spend(spent, shown - bonus, patience, STEP_S)
-    return elapsed_s
+    return f"after about {left_after_s(lead - spec.tuning.bonus, spec.price_s, timing.smoothing_s):.2g} s"
 
 
 def _bounds(spec: TaskSpec) -> Iterator[str]:
     """How often it moves at most."""
-    yield f"after a move it stays at least {spec.tuning.cool_down_s:g} s (cool_down_s), unless its owner fails"
-    capped = f"it moves at most {spec.max_moves_per_minute} times a minute (max_moves_per_minute)"
-    yield f"{capped}, and away from failures at most {ESCAPES_PER_MINUTE} times"
+    yield f"it moves at most {spec.max_moves_per_minute} times a minute, from failures {ESCAPES_PER_MINUTE} times"
 
 
 def _links(spec: TaskSpec) -> Iterator[str]:
@@ -158,12 +130,10 @@ def _links(spec: TaskSpec) -> Iterator[str]:
     if spec.tuning.weights.network > 0.0:
         yield f"a signal is worth 0 at {limits.nu_dbm:g} dBm and 1 from {limits.rho_dbm:g} dBm on (link.rho_dbm)"
         yield f"through one access point {_PAIR[limits.pair]} counts (link.pair: {limits.pair})"
-        ahead = f"as they will be in {limits.foresee_s:g} s, at most {FORESEE_MOST_DB:g} dB away"
-        yield f"signals count {ahead if limits.foresee_s else 'as they are'} (link.foresee_s)"
 
 
 ON_TOP = (
-    "that is smoothing and patience alone: sampling, gathering, the vote and the commit come on top (with the "
+    "that is smoothing and the price alone: sampling, gathering, the vote and the commit come on top (with the "
     "defaults 0.7 to 3.0 s were seen from a real load to the move)"
 )
 LATENCY = (

@@ -16,7 +16,7 @@ from zsched.commands.document import CODES, status_of
 from zsched.commands.orders import OrderView, begin, check_name, check_said, tell_results
 from zsched.commands.weight_words import NAMES, shares
 from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault
-from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, default_patience
+from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
 from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
 from zsched.core.values.struct import replace
 from zsched.core.values.words import meant, shown
@@ -25,14 +25,13 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 TUNING_SCHEMA: Final = "zsched.tuning/1"
 
 
-_NUMBERS: Final = ("bonus", "cool_down_s", "deadline_ms")
+_NUMBERS: Final = ("bonus", "deadline_ms")
 _WORDS: Final[Mapping[str, type[StrEnum]]] = {
     "aggregate": Aggregate,
     "score": ScoreForm,
     "reach": Reach,
     "pair": PairReading,
 }
-_WHOLE: Final = ("max_moves_per_minute",)
 WEIGHTS: Final = NAMES
 OF_THE_FILE: Final = (*TUNED_RULES, *TUNED_LINKS)
 """Settings that follow the fleet file, unless an operator has set another value."""
@@ -41,8 +40,6 @@ KEYS: Final = (*WEIGHTS, *_NUMBERS, "aggregate", "score", *OF_THE_FILE)
 
 def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
     """A tuning, as JSON values, after ``key=value`` words; ``key=null`` is the file's value.
-
-    A patience that nobody has given goes along with weights and score.
 
     >>> base = {"weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0}, "bonus": 0.1}
     >>> tuned(base, base, ["bonus=0.2"])["bonus"]
@@ -68,29 +65,14 @@ def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
         default = source.get(key, 0.0) if key in WEIGHTS else source.get(key)
         place[key] = default if text == "null" else _setting(pair, key, text)
     after["weights"] = shares(after["weights"])
-    is_untuned = "patience" not in seen and before.get("patience") == _file_patience(before, file)
-    if is_untuned or "patience=null" in pairs:
-        after["patience"] = _file_patience(after, file)
     return after
-
-
-def _file_patience(tuning: Json, file: Json) -> float | None:
-    """The patience under ``tuning`` of a task whose own was not tuned; ``None``: it is learnt."""
-    given: float | None = file.get("patience")
-    return _default_patience(tuning) if given == _default_patience(file) else given
-
-
-def _default_patience(tuning: Json) -> float | None:
-    score = ScoreForm.PAPER if tuning.get("score") == ScoreForm.PAPER else ScoreForm.SERVICE
-    return default_patience(score, shares(tuning["weights"]).get("network", 0.0))
 
 
 def _setting(pair: str, key: str, text: str) -> Any:
     try:
-        return str(_WORDS[key](text)) if key in _WORDS else int(text) if key in _WHOLE else float(text)
+        return str(_WORDS[key](text)) if key in _WORDS else float(text)
     except ValueError:
-        number = "a whole number" if key in _WHOLE else "a number"
-        kind = f"one of {', '.join(list(_WORDS[key]))}" if key in _WORDS else number
+        kind = f"one of {', '.join(list(_WORDS[key]))}" if key in _WORDS else "a number"
         raise CliError(EXIT_USAGE, f"{pair!r}: {text!r} is not {kind}") from None
 
 
@@ -112,7 +94,7 @@ def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
     tuning = _checked(after, file_tuning(task))
     flat_before, flat_after = _flat(task["tuning"]), _flat(after)
     rows = [
-        (name, key, _figure(key, flat_before.get(key, 0.0)), _figure(key, flat_after.get(key, 0.0)))
+        (name, key, _figure(flat_before.get(key, 0.0)), _figure(flat_after.get(key, 0.0)))
         for key in KEYS
         if flat_before.get(key, 0.0) != flat_after.get(key, 0.0)
     ]
@@ -149,7 +131,6 @@ def _checked(after: Json, file: Json) -> Json:
         tuning = Tuning(
             weights=Weights.of(after["weights"]),
             bonus=after["bonus"],
-            cool_down_s=after["cool_down_s"],
             aggregate=Aggregate(after["aggregate"]),
             score=ScoreForm(after["score"]),
             deadline_ms=deadline_ms,
@@ -161,8 +142,7 @@ def _checked(after: Json, file: Json) -> Json:
     if nu is not None and rho is not None and nu >= rho:
         raise CliError(EXIT_USAGE, f"nu_dbm ({nu:g}) must be below rho_dbm ({rho:g}); nothing was changed")
     check_deadline(after, file)
-    by_file = {**file, "patience": _file_patience(after, file)}
-    kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == by_file.get(key)}
+    kept: dict[str, Any] = {key: None for key in OF_THE_FILE if after.get(key) == file.get(key)}
     body: Json = as_plain(replace(tuning, **kept))
     return body
 
@@ -199,9 +179,9 @@ def _flat(tuning: Json) -> Json:
     return {**shares(tuning["weights"]), **{key: tuning.get(key) for key in KEYS if key not in WEIGHTS}}
 
 
-def _figure(key: str, value: Any) -> str:
+def _figure(value: Any) -> str:
     if value is None:
-        return {"patience": "learnt"}.get(key, "none")
+        return "none"
     return f"{value:g}" if isinstance(value, float | int) else str(value)
 
 
@@ -219,11 +199,9 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
         print_json({"schema": TUNING_SCHEMA, "tasks": found})
         return EXIT_OK
     for task in tasks:
-        by_file = file_tuning(task)
-        now, file = _flat(task["tuning"]), _flat(by_file)
-        file["patience"] = _file_patience(task["tuning"], by_file)
+        now, file = _flat(task["tuning"]), _flat(file_tuning(task))
         words = [
-            f"{key}={_figure(key, now.get(key, 0.0))}{_differs(key, now.get(key, 0.0), file.get(key, 0.0))}"
+            f"{key}={_figure(now.get(key, 0.0))}{_differs(now.get(key, 0.0), file.get(key, 0.0))}"
             for key in KEYS
             if key in now or key in file
         ]
@@ -231,5 +209,5 @@ def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
     return EXIT_OK
 
 
-def _differs(key: str, now: Any, file: Any) -> str:
-    return "" if now == file else f" (file: {_figure(key, file)})"
+def _differs(now: Any, file: Any) -> str:
+    return "" if now == file else f" (file: {_figure(file)})"

@@ -121,34 +121,21 @@ class Flag(Struct, frozen=True):
         return "`true` or `false`" if self.only is None else f"`{str(self.only).lower()}`"
 
 
-class Removed(Struct, frozen=True, kw_only=True):
-    """A key or a word that fleet files had once: why it is gone, and what to write instead."""
-
-    why: str
-    instead: str
-
-
 class Choice(Struct, Generic[T], frozen=True):
     """One of some words, each standing for a value."""
 
     values: Lookup[str, T]
-    removed: Lookup[str, Removed] = field(default_factory=dict)
-    """Words that it had once."""
 
     @classmethod
-    def of(cls, kind: type[T], removed: Lookup[str, Removed] | None = None) -> Choice[T]:
+    def of(cls, kind: type[T]) -> Choice[T]:
         """The words of an enumeration of strings."""
         assert issubclass(kind, StrEnum)
-        return cls({str(member): member for member in kind}, removed or {})
+        return cls({str(member): member for member in kind})
 
     def read(self, node: Node, out: Collector) -> T | None:
         """The value that the word stands for."""
         if not isinstance(node, Scalar) or node.is_null:
             _refuse(node, out, self.says())
-            return None
-        gone = self.removed.get(node.text)
-        if gone is not None:
-            out.error(node.place, f"there is no {node.text!r} here any more: {gone.why}", gone.instead)
             return None
         if node.text not in self.values:
             out.error(node.place, f"{node.text!r} is not {self.says()}", nearest(node.text, self.values))
@@ -314,8 +301,8 @@ class Record(Struct, frozen=True):
 
     what: str
     items: Lookup[str, Field]
-    removed: Lookup[str, Removed] = field(default_factory=dict)
-    """Keys that it had once."""
+    removed: Lookup[str, str] = field(default_factory=dict)
+    """{key that files had once: what to write instead}; files and agreed documents with it stay in force."""
 
     def read(self, node: Node, out: Collector) -> Section | None:
         """Every key that could be read; unknown, double and missing ones are faults."""
@@ -344,7 +331,7 @@ class Record(Struct, frozen=True):
         if gone is None:
             out.error(key.place, f"{self.what} has no key {key.text!r}", nearest(key.text, self.items))
         else:
-            out.error(key.place, f"{self.what} has no key {key.text!r} any more: {gone.why}", gone.instead)
+            out.warn(key.place, f"{self.what} has no key {key.text!r} any more; nothing is done with it", gone)
 
     def says(self) -> str:
         """Its keys."""

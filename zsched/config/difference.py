@@ -522,9 +522,6 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
     for name in TASK_RULES:
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, f"{path}.scheduling.{name}", getattr(old, name), getattr(new, name))
-    patience, other = ("learnt" if task.learns_patience else task.patience for task in (old, new))
-    if patience != other:
-        yield _set(AT_ONCE, f"{path}.scheduling.patience", patience, other)
 
 
 _OF_A_PROCESS: Final = ("command", "env", "link", "user")

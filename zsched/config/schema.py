@@ -23,22 +23,17 @@ from zsched.config.blocks import (
     MapOf,
     Number,
     Record,
-    Removed,
     Text,
 )
 from zsched.config.drivers import DRIVER_KEYS
 from zsched.config.keys import keys
 from zsched.config.ros2 import ros2_record
 from zsched.config.timing import PROFILES
-from zsched.core.scheduler.patience import CHOICES
 from zsched.core.values.certificates import parse_label
 from zsched.core.values.endpoint import HOST_PORT, WITH_PATH, Endpoint
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
-    DEFAULT_COOL_DOWN_S,
     DEFAULT_SCORE,
-    PAPER_PATIENCE,
-    RADIO_PATIENCE,
     TASK_RULES,
     Demand,
     Fleet,
@@ -53,7 +48,6 @@ from zsched.core.values.fleet import (
 from zsched.core.values.gauges import GAUGES, Gauge
 from zsched.core.values.model import (
     MAX_DEADLINE_MS,
-    MAX_PATIENCE,
     MIN_DEADLINE_MS,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
@@ -245,11 +239,6 @@ SCHEDULING: Final = Record(
             "Added to the owner's joint utility: what a move must gain.",
             default=f"`{DEFAULT_BONUS:g}`",
         ),
-        "cool_down_s": Field(
-            Number(0, 86400, "s"),
-            "Least stay after a move.",
-            default=f"`{DEFAULT_COOL_DOWN_S:g}`",
-        ),
         "score": Field(
             Choice.of(ScoreForm),
             "What a machine is worth to the task: `service`, the share of its work that the task would get done there; "
@@ -274,46 +263,19 @@ SCHEDULING: Final = Record(
             default=f"`{Aggregate.MEAN}`",
         ),
         **keys(TaskSpec, *TASK_RULES),
-        "patience": Field(
-            Number(0, MAX_PATIENCE),
-            "What staying may cost before the task moves. A second of staying costs what the best candidate's lead in "
-            f"utility has beyond the bonus: with a bonus of {DEFAULT_BONUS:g} a lead of 0.1 costs "
-            f"{0.1 - DEFAULT_BONUS:g}, and reaches 0.3 in {0.3 / (0.1 - DEFAULT_BONUS):g} s. `0`: the first lead that "
-            "is seen is followed.",
-            default=f"learnt, {CHOICES[0]:g} to {CHOICES[-1]:g}; `{RADIO_PATIENCE:g}` with a weight for the network; "
-            f"`{PAPER_PATIENCE:g}` with `score: paper`",
-        ),
     },
     removed={
-        "time_to_trigger_s": Removed(
-            why="a timer follows a big lead as late as a small one, and patience loses less under every load",
-            instead="delete it: the task learns its patience; or patience: 0.3, lead beyond the bonus times seconds",
-        ),
-        "pays_off_in_s": Removed(
-            why="it gained only where a move costs ten seconds and more, and no more than a larger bonus does there",
-            instead="delete it; where moves are that dear: bonus: 0.2",
-        ),
+        "patience": "delete it; or price_s: 0.3, what a move costs in seconds of the task's work",
+        "cool_down_s": "delete it; where a move is dear: price_s: 2",
+        "max_moves_per_minute": "delete it: it is 6",
     },
 )
 
-_PAIR: Final = Choice.of(
-    PairReading,
-    {
-        "mean": Removed(
-            why="its leads were a quarter of candidate's, less than the bonus that noise asks for",
-            instead="pair: candidate, which ranks three robots and more as mean did; of two: pair: weaker",
-        )
-    },
-)
+_PAIR: Final = Choice.of(PairReading)
 LINK_LIMITS: Final = Record(
     "a link section",
     keys(LinkLimits, pair=_PAIR),
-    removed={
-        "knee_dbm": Removed(
-            why="a knee gained nothing, and which signal it is depends on the radio",
-            instead="delete it: between nu_dbm and rho_dbm a link's worth is linear",
-        ),
-    },
+    removed={"foresee_s": "delete it: signals count as they are"},
 )
 
 WORKER: Final = Record(

@@ -17,12 +17,9 @@ from zsched.config.rulecheck import RuleConflict, rule_conflicts
 from zsched.core.route.ros2 import DOMAIN
 from zsched.core.route.route import NOBODY, PLACEHOLDERS, named_rules, placeholders
 from zsched.core.route.templates import merges_keys, rule_fault, shared_key_fault, template_fault
-from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault, tells_jobs
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
-    DEFAULT_COOL_DOWN_S,
-    DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
     TASK_RULES,
     TUNED_RULES,
@@ -33,7 +30,6 @@ from zsched.core.values.fleet import (
     StreamRule,
     TaskSpec,
     WorkerSpec,
-    default_patience,
 )
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import NodeKind, Objective, ScoreForm, Tuning, Weights
@@ -95,7 +91,6 @@ def _task(
     _check_mirrors(given, streams, out)
     scheduling: Section | None = given.get("scheduling")
     more = {} if scheduling is None else _of(scheduling, *TASK_RULES)
-    patience = _patience(scheduling, (tuning or _ANY_TUNING).weights)
     demand: Section | None = given.get("demand")
     gauge_limits: Section | None = given.get("limits")
     task = TaskSpec(
@@ -107,8 +102,6 @@ def _task(
         gauge_limits=() if gauge_limits is None else tuple(sorted(gauge_limits.values.items())),
         worker=worker,
         rules=tuple(stream.value for stream in streams),
-        patience=FIRST_PATIENCE if patience is None else patience,
-        learns_patience=patience is None,
         **_of(given, "on_isolation", "exclusive", "drain_s"),
         **more,
     )
@@ -159,7 +152,7 @@ def _tuning(given: Section, out: Collector) -> Tuning | None:
     scheduling: Section | None = given.get("scheduling")
     score = _score(scheduling)
     deadline = {} if scheduling is None else _deadline(scheduling, score, weights, out)
-    default: dict[str, Any] = {"bonus": DEFAULT_BONUS, "cool_down_s": DEFAULT_COOL_DOWN_S}
+    default: dict[str, Any] = {"bonus": DEFAULT_BONUS}
     if scheduling is None:
         return Tuning(weights=weights, score=score, **default)
     more = {"score": score, **default, **_of(scheduling, *default), **deadline}
@@ -190,16 +183,6 @@ def _deadline(scheduling: Section, score: ScoreForm, weights: Weights, out: Coll
     return {"deadline_ms": None}
 
 
-def _patience(scheduling: Section | None, weights: Weights) -> float | None:
-    """As given, or the default; ``None``: the task learns it.
-
-    It does not where a radio counts, whose noise costs as much as it (0033).
-    """
-    values = {} if scheduling is None else scheduling.values
-    patience: float | None = values.get("patience", default_patience(_score(scheduling), weights.network))
-    return patience
-
-
 def _score(scheduling: Section | None) -> ScoreForm:
     values = {} if scheduling is None else scheduling.values
     score: ScoreForm = values.get("score", DEFAULT_SCORE)
@@ -209,9 +192,8 @@ def _score(scheduling: Section | None) -> ScoreForm:
 def _limits(given: Section, out: Collector) -> LinkLimits:
     section: Section | None = given.get("link")
     if section is None:
-        return LinkLimits(foresee_s=DEFAULT_FORESEE_S)
-    ahead = {"foresee_s": DEFAULT_FORESEE_S, **_of(section, "foresee_s")}
-    limits = section.build(LinkLimits, out, **ahead) or LinkLimits()
+        return LinkLimits()
+    limits = section.build(LinkLimits, out) or LinkLimits()
     if section.is_whole and limits.nu_dbm >= limits.rho_dbm:
         place = section.where("nu_dbm" if "nu_dbm" in section.places else "rho_dbm")
         out.error(place, f"nu_dbm ({limits.nu_dbm:g}) must be below rho_dbm ({limits.rho_dbm:g})")

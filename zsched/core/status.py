@@ -438,7 +438,6 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         phase=executor.phase.value,
         tuning=spec.in_force(value.tuning),
         candidates=spec.candidates,
-        patience=standing.judge.patience,
         round_trips=_round_trips(node, spec) if value.tuning.deadline_ms is not None else (),
         decision=_decision(standing, now),
         vote=_vote(node.votes.tasks[spec.name], now),

@@ -886,10 +886,10 @@ VOTE_BUGS = (
         _ROUNDS,
     ),
     _bug(
-        "cool-down skipped",
+        "a move is free",
         SCHEDULER,
-        "if settled_for_s < tuning.cool_down_s:",
-        "if settled_for_s < 0.0:",
+        "if more_s < price_s:",
+        "if more_s < 0.0:",
         _SCHEDULER,
     ),
     _bug(
@@ -902,8 +902,8 @@ VOTE_BUGS = (
     _bug(
         "bonus twice",
         SCHEDULER,
-        "max(value + (bonus if name == owner else 0.0)",
-        "max(value + (2 * bonus if name == owner else 0.0)",
+        "(allocation.tuning.bonus if name == owner else 0.0)",
+        "(2 * allocation.tuning.bonus if name == owner else 0.0)",
         _SCHEDULER,
     ),
     _bug(
@@ -1236,11 +1236,11 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_latency.py",),
     ),
     _bug(
-        "a load that begins makes a task patient",
-        "zsched.core.scheduler.patience",
-        "if all(player.owner is not None and best - aggregates[player.owner] <= bonus for player in self._players):",
-        "if best >= 0.0:",
-        ("tests/unit/core/scheduler/test_patience.py",),
+        "an account holds more than a move costs above the least",
+        "zsched.core.scheduler.ledger",
+        "min(one - least, price_s if name == owner else ELSEWHERE * price_s)",
+        "one - least",
+        ("tests/unit/core/scheduler/test_ledger.py",),
     ),
     _bug(
         "median and mean swapped",
@@ -1427,18 +1427,10 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_judge.py",),
     ),
     _bug(
-        "what staying has cost is forgotten where the owner is not scored for a moment",
+        "an owner that cannot have its task loses nothing",
         "zsched.core.scheduler.judge",
-        "0.0 if owner is None else self.spent, None",
-        "0.0, None",
-        ("tests/unit/core/scheduler/test_judge.py",),
-    ),
-    _bug(
-        "each score of an owner gives it its whole time without one again",
-        "zsched.core.scheduler.judge",
-        "self.unscored.look(not is_scored, now, UNSCORED_S)",
-        "self.unscored.look(not is_scored, now, UNSCORED_S)\n"
-        "        self.unscored = Absences() if is_scored else self.unscored",
+        "{name: 1.0 - worth.get(name, 0.0) for name in sorted(names)}",
+        "{name: 1.0 - worth.get(name, 1.0) for name in sorted(names)}",
         ("tests/unit/core/scheduler/test_judge.py",),
     ),
     _bug(
@@ -1570,8 +1562,8 @@ ORDER_BUGS = (
     _bug(
         "a hard pin gives way",
         SCHEDULER,
-        "        if allocation.is_bound:\n            scored",
-        "        if allocation.is_bound and owner is None:\n            scored",
+        "(not allocation.is_bound or name in (home, owner))",
+        "(not allocation.is_bound or owner is not None or name in (home, owner))",
         _SCHEDULER,
         seed=7,
     ),
@@ -1583,9 +1575,9 @@ ORDER_BUGS = (
         _SCHEDULER,
     ),
     _bug(
-        "a pinned task goes home without the cool-down",
+        "a pinned task goes home at once",
         SCHEDULER,
-        "if fit_s >= allocation.tuning.cool_down_s else Outcome.WAIT",
+        "if fit_s >= FIT_S else Outcome.WAIT",
         "if fit_s >= 0.0 else Outcome.WAIT",
         _SCHEDULER,
     ),

@@ -41,8 +41,8 @@ FLAG_BUGS: tuple[Bug, ...] = (
     _bug(
         "a drained owner that leads stays",
         JUDGE,
-        "            if leaving is None or name != owner\n",
-        "            if escape is None or name != owner\n",
+        "if (leaving is None or name != owner)",
+        "if (escape is None or name != owner)",
         _JUDGE,
         has_schedules=True,
     ),
@@ -103,8 +103,8 @@ FLAG_BUGS: tuple[Bug, ...] = (
     _bug(
         "a drain is stronger than a hard pin",
         JUDGE,
-        "        if allocation.is_bound:\n            scored",
-        "        if allocation.is_bound and not is_drain:\n            scored",
+        "(not allocation.is_bound or name in (home, owner))",
+        "(not allocation.is_bound or is_drain or name in (home, owner))",
         _JUDGE,
     ),
     _bug(

@@ -15,8 +15,8 @@ from pathlib import Path
 from zsched_lab.decisions import drives, figures, halls, report, study
 from zsched_lab.decisions.service import command
 
-PARTS = ("compare", "sweep", "options", "cool-down", "smoothing")
-SHOWN = ("zsched by service", "zsched", "zsched, timer", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
+PARTS = ("compare", "sweep", "options")
+SHOWN = ("zsched by service", "zsched", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
 
 
 def parse() -> argparse.Namespace:
@@ -47,8 +47,6 @@ def play(given: argparse.Namespace) -> None:
         "compare": study.compared(candidates),
         "sweep": study.swept(),
         "options": study.options(),
-        "cool-down": study.cooled(),
-        "smoothing": study.smoothed(),
     }
     seeds = study.TRAIN if given.seeds == "train" else study.TEST
     only = frozenset(filter(None, given.only.split(";")))
@@ -76,7 +74,7 @@ def show(out: Path, folder: Path | None) -> None:
         figures.rules(rows, out / "rules.png")
     if {"equal", "step"} <= cases:
         figures.stickiness(rows, out / "stickiness.png")
-    if "fading" in cases:
+    if "robots" in cases:
         figures.options(rows, out / "options.png")
     if any(case.startswith("long-") for case in cases):
         figures.sizes(rows, out / "sizes.png")

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from zsched.core.values.fleet import RADIO_PATIENCE, LinkLimits
+from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import PairReading, ScoreForm
 from zsched_lab.decisions import entries
 from zsched_lab.decisions.radio import Drive, read_drive
@@ -66,29 +66,19 @@ def cast(world: World) -> tuple[Entry, ...]:
     """Who drives: zsched, what it could be, and the yardsticks."""
     return (
         *entries.ours(world),
-        Entry(
-            name="zsched by service",
-            limits=entries.foreseeing(world),
-            make=entries.core(world, patience=RADIO_PATIENCE, form=ScoreForm.SERVICE),
-        ),
-        Entry(name="ledger", make=entries.by_ledger(world)),
+        Entry(name="zsched by service", make=entries.core(world, form=ScoreForm.SERVICE)),
         *(
-            Entry(name=f"timer, bonus {bonus:g}", make=entries.timed(world, bonus=bonus))
-            for bonus in (0.03, 0.05, 0.07)
-        ),
-        *(
-            Entry(
-                name=f"timer, bonus {bonus:g}, smoothing 3 s",
-                look=Look(smoothing_s=3.0),
-                make=entries.timed(world, bonus=bonus),
-            )
+            Entry(name=f"by service, bonus {bonus:g}", make=entries.core(world, bonus=bonus, form=ScoreForm.SERVICE))
             for bonus in (0.05, 0.1)
         ),
-        *entries.foresights(world),
-        *entries.smoothings(world),
+        Entry(
+            name="by service, smoothing 1 s",
+            look=Look(smoothing_s=1.0),
+            make=entries.core(world, form=ScoreForm.SERVICE),
+        ),
         Entry(
             name="the weaker way",
-            limits=entries.foreseeing(world, pair=PairReading.WEAKER),
+            limits=LinkLimits(pair=PairReading.WEAKER),
             make=entries.core(world),
         ),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),

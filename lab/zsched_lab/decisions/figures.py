@@ -29,14 +29,14 @@ KINDS: Final = (
     ("short", "loads of 3 to 20 s"),
     ("radio", "driving robots, loads of 60 to 240 s"),
 )
-OPTIONS: Final = {"fading": "driving robots, three edges", "robots": "three robots, one access point"}
+OPTIONS: Final = {"robots": "three robots, one access point"}
 STEP_GOAL_S: Final = 4.3
 """Time-to-trigger, 0.6 time constants and a round (design)."""
 DPI: Final = 110
 
 
 def _colour(rule: str) -> str:
-    if rule.startswith(("zsched", "patience")):
+    if rule.startswith("zsched"):
         return OURS
     return THEIRS if rule.startswith("dyna") else YARDSTICK
 
@@ -127,19 +127,17 @@ def grid(rows: Sequence[Row], path: Path) -> None:
     cases = grid_played(rows)
     moves = {name: statistics.fmean(rate(of(rows, case, name), "moves") for case in cases) for name in regrets}
     groups = (
-        ("time-to-trigger, smoothing 3 s", "#2c6fbb", "s3 ", " t"),
-        ("time-to-trigger, smoothing 1 s", "#74b3e0", "s1 ", " t"),
-        ("patience, smoothing 3 s", "#2e8b57", "s3 ", " p"),
-        ("patience, smoothing 1.5 s", "#90d0a8", "s1.5 ", " p"),
-        ("patience, smoothing 1 s", "#c9a227", "s1 ", " p"),
+        ("smoothing 3 s", "#2e8b57", "s3 "),
+        ("smoothing 1 s", "#c9a227", "s1 "),
+        ("smoothing 0.3 s", "#2c6fbb", "s0.3 "),
     )
-    for label, colour, smoothing, trigger in groups:
-        names = [name for name in regrets if name.startswith(smoothing) and trigger in name]
+    for label, colour, smoothing in groups:
+        names = [name for name in regrets if name.startswith(smoothing)]
         axis.scatter([moves[n] for n in names], [100 * regrets[n] for n in names], s=22, color=colour, label=label)
-    for (label, name), colour in zip(STARS.items(), (OURS, "black"), strict=True):
+    for label, name in STARS.items():
         if name in regrets:
             place = ([moves[name]], [100 * regrets[name]])
-            axis.scatter(*place, s=120, marker="*", color=colour, label=f"{label}: {name}")
+            axis.scatter(*place, s=120, marker="*", color=OURS, label=f"{label}: {name}")
     axis.set_xlabel("moves per hour")
     axis.set_ylabel("mean regret, %")
     kinds = ", ".join(case.removeprefix("sweep ") for case in cases)

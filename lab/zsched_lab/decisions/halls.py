@@ -1,4 +1,4 @@
-"""Simulated drives, as many as are wanted: how far patience follows a radio, with what scatter over drives.
+"""Simulated drives, as many as are wanted: how far a price of moves follows a radio, with what scatter over drives.
 
 Knows: a hall with one access point, drives by seed, the rules that are compared. Does not know: recordings.
 
@@ -18,7 +18,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from zsched.core.values.fleet import RADIO_PATIENCE
 from zsched.core.values.model import ScoreForm
 from zsched_lab.decisions import entries, radio
 from zsched_lab.decisions.drives import UNSMOOTHED, compare
@@ -29,7 +28,7 @@ from zsched_lab.decisions.world import DT_S, World
 
 MACHINES: Final = 3
 DRIVE_S: Final = 262.0
-PATIENCES: Final = (0.2, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6)
+PRICES_S: Final = (0.1, 0.2, 0.3, 0.4, 0.6)
 FIRST: Final = {"train": 2000, "test": 1000}
 """The first seed: settings are chosen on *train* and checked on *test*."""
 MOST_DRIVES: Final = 900
@@ -50,17 +49,12 @@ class Row(NamedTuple):
 
 
 def cast(world: World) -> tuple[Entry, ...]:
-    """By service with several patiences, the paper's rule by the network, and plain argmax."""
+    """By service with several prices of a move, the paper's rule by the network, and plain argmax."""
     return (
         *(
-            Entry(
-                name=f"patience {patience:g}{' (default)' if patience == RADIO_PATIENCE else ''}",
-                limits=entries.foreseeing(world),
-                make=entries.core(world, patience=patience, form=ScoreForm.SERVICE),
-            )
-            for patience in PATIENCES
+            Entry(name=f"price {price_s:g} s", make=entries.core(world, price_s=price_s, form=ScoreForm.SERVICE))
+            for price_s in PRICES_S
         ),
-        Entry(name="ledger", make=entries.by_ledger(world)),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),
     )

@@ -17,9 +17,6 @@ RULES: Final = (
     *(
         "oracle",
         "zsched",
-        "zsched, timer",
-        "zsched, timer, bonus 0.05",
-        "patience without foresight",
         "fixed_e1",
         "fixed_e2",
         "fixed_e3",
@@ -34,7 +31,7 @@ ERRORS: Final = 1.96
 """Standard errors: a 95 % interval if there are many seeds."""
 GRID_CASES: Final = ("sweep long", "sweep mixed", "sweep radio")
 """The kinds of histories that rank the settings of the grid; between equal nodes there is no regret to rank by."""
-STARS: Final[Mapping[str, str]] = {"the default": "s0.3 b0.05 p0.55 c2", "the timer": "s0.3 b0.1 t2 c10"}
+STARS: Final[Mapping[str, str]] = {"the default": "s0.3 b0.05 p0.3"}
 """Settings of the grid that have a name."""
 
 
@@ -120,7 +117,7 @@ def sweep_table(rows: Sequence[Row], top: int = 15) -> str:
     ranked = sorted(grid_regrets(rows).items(), key=lambda item: item[1])
     shown = ranked[:top] + [item for item in ranked[top:] if item[0] in STARS.values()]
     lines = [
-        "| smoothing, bonus, trigger, cool-down | mean regret % | "
+        "| smoothing, bonus, price | mean regret % | "
         + " | ".join(f"{case.removeprefix('sweep ')}: regret %, moves / h" for case in cases)
         + " |",
         "| --- | --- |" + " --- |" * len(cases),

@@ -4,8 +4,7 @@ Knows: when each rule looks, and which node it then chooses. Does not know: the 
 
 `CoreRule` is the production's decision: `zsched.core.scheduler.decision` at each robot, a called vote, the tally, flap
 damping. It does what `zsched.core.scheduler.rounds` does when no message is lost;
-`tests/unit/lab/decisions/test_same_as_nodes.py` holds the two together. `TimedJudge` is what the production decided by
-before patience: a yardstick.
+`tests/unit/lab/decisions/test_same_as_nodes.py` holds the two together.
 """
 
 from __future__ import annotations
@@ -14,23 +13,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from random import Random
-from typing import Any, Protocol
+from typing import Protocol
 
 from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide_by, rules_of
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.standing import Standing, pick
 from zsched.core.values.decision import Figures, Rules
-from zsched.core.values.fleet import PAPER_PATIENCE, TaskSpec
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, ScoreForm, Tuning
 from zsched.core.vote.tally import VoteOutcome, tally
-from zsched_lab.decisions.ledger import Ledger, LedgerJudge
 from zsched_lab.decisions.view import Sight
 
 COMMIT_S = 0.03
 """From the vote to the commit; measured on loopback (`benchmarks.commit`)."""
-TIMER_MARGIN_S = 0.001
-"""Sums of floats: a timer has certainly ended this much later."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,75 +49,30 @@ class Rule(Protocol):
         ...
 
 
-class TimedJudge(Judge):
-    """The production's judge with a time-to-trigger in place of patience: another candidate must lead for that long.
-
-    A time-to-trigger is counted from the first judgement at which the owner is beaten, by whomever, without a break
-    (docs/decisions/0017; patience took its place by docs/decisions/0021).
-    """
-
-    __slots__ = ("beaten_since", "trigger_s")
-
-    def __init__(self, spec: TaskSpec, trigger_s: float) -> None:
-        super().__init__(spec=replace(spec, patience=0.0, learns_patience=False))
-        self.trigger_s = trigger_s
-        self.beaten_since: float | None = None
-
-    def reset(self, *, is_new_owner: bool = False) -> None:
-        """As `Judge.reset`; the whole time counts again."""
-        super().reset(is_new_owner=is_new_owner)
-        self.beaten_since = None
-
-    def judge(self, standing: Standing, allocation: Allocation, **given: Any) -> Judgement:
-        """As `Judge.judge`, but that a planned move waits for its time."""
-        judgement, owner, now = super().judge(standing, allocation, **given), allocation.owner, float(given["now"])
-        if owner is None or pick(judgement.aggregates, owner) in (None, owner):
-            self.beaten_since = None
-            return judgement
-        self.beaten_since = now if self.beaten_since is None else self.beaten_since
-        is_planned = judgement.outcome is Outcome.PROPOSE and not (judgement.is_escape or given["is_called"])
-        if not is_planned or now - self.beaten_since >= self.trigger_s:
-            return judgement
-        aggregate = judgement.aggregates.get(owner, 0.0)
-        return replace(judgement, outcome=Outcome.WAIT, candidate=owner, aggregate=aggregate)
-
-
 @dataclass(slots=True)
 class CoreRule:
-    """The production's decision under some tuning; with a ``time_to_trigger_s`` as it was before it had patience."""
+    """The production's decision under some tuning."""
 
     view: Sight
     tuning: Tuning
-    patience: float = PAPER_PATIENCE
-    learns_patience: bool = False
-    time_to_trigger_s: float | None = None
-    ledger: Callable[[], Ledger] | None = None
-    """In place of patience."""
+    price_s: float = 0.3
+    memory_s: float = 200.0
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
     _damping: Damping = field(default_factory=Damping)
     _settled_at: float = -math.inf
-    _due: float = math.inf
     _spec: TaskSpec = field(init=False)
     _rules: Rules = field(init=False)
 
     def __post_init__(self) -> None:
-        self._spec = replace(self.view.spec, patience=self.patience, learns_patience=self.learns_patience)
+        self._spec = replace(self.view.spec, price_s=self.price_s, memory_s=self.memory_s)
         self._rules = rules_of(self._spec)
-        self._judges = [self._new_judge() for _ in self.view.fleet.voters]
+        self._judges = [Judge(spec=self._spec) for _ in self.view.fleet.voters]
         self._allocation = Allocation(task=self._spec.name, revision=0, epoch=0, owner=None, tuning=self.tuning)
-
-    def _new_judge(self) -> Judge:
-        if self.ledger is not None:
-            return LedgerJudge(self._spec, self.ledger())
-        timer_s = self.time_to_trigger_s
-        return Judge(spec=self._spec) if timer_s is None else TimedJudge(self._spec, timer_s)
 
     def round(self, seats: tuple[int, ...], at_s: float, now: float) -> None:
         """Judge at every robot whose turn it is; the first that proposes a move calls the vote."""
-        if now >= self._due:
-            seats, self._due = tuple(range(len(self._judges))), math.inf
         if not seats:
             return
         by_service = self.tuning.score is ScoreForm.SERVICE
@@ -132,7 +83,6 @@ class CoreRule:
             if judgement.outcome is Outcome.PROPOSE:
                 self._vote(seat, judgement, standing, at_s, now)
                 return
-            self._wake_when_due(seat, judgement, now)
 
     def _judge(self, seat: int, standing: Standing, now: float, *, is_called: bool) -> Judgement:
         owner, voters, electors = self._allocation.owner, self.view.fleet.voters, self.view.fleet.electors
@@ -152,15 +102,6 @@ class CoreRule:
             is_called=is_called,
         )
         return decide_by(standing, self._judges[seat], self._damping, figures).judgement
-
-    def _wake_when_due(self, seat: int, judgement: Judgement, now: float) -> None:
-        """A lead that only waits for a time-to-trigger and the cool-down is judged when they end."""
-        judge = self._judges[seat]
-        if judgement.outcome is not Outcome.WAIT or not isinstance(judge, TimedJudge) or judge.beaten_since is None:
-            return
-        ends = max(judge.beaten_since + judge.trigger_s, self._settled_at + self.tuning.cool_down_s)
-        if ends + TIMER_MARGIN_S > now:
-            self._due = min(self._due, ends + TIMER_MARGIN_S)
 
     def _vote(self, caller: int, first: Judgement, standing: Standing, at_s: float, now: float) -> None:
         """Every robot answers the caller with today's winner; the tally decides (Alg. 3)."""

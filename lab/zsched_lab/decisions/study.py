@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -98,10 +98,8 @@ def swept() -> tuple[Case, ...]:
 
 
 def options() -> tuple[Case, ...]:
-    """What might be better than the paper's: prediction of a fading link, readings of a pair, dear moves."""
-    radio = _loads(3, loads.LONG, with_radio=True)
+    """What might be better than the paper's: readings of a pair, dear moves."""
     return (
-        Case(name="fading", build=radio, cast=lambda world, _seed: entries.fading(world), hours=1.0),
         Case(name="robots", build=_robots, cast=lambda world, _seed: entries.readings(world), hours=1.0),
         *(_costly(cost_s) for cost_s in COSTS_S),
     )
@@ -115,26 +113,6 @@ def _costly(cost_s: float) -> Case:
         hours=1.0,
         move_cost_s=cost_s,
     )
-
-
-def cooled() -> tuple[Case, ...]:
-    """How long a task should stay after a move at least."""
-    whole = tuple(case for case in compared(()) if case.hours == 1.0)
-    return _to_others("cool-down", whole, entries.cool_downs)
-
-
-def smoothed() -> tuple[Case, ...]:
-    """How much profiles should be smoothed, and how patient a task should then be; in larger fleets, too."""
-    return _to_others("smoothing", compared((10, 50)), entries.smoothings)
-
-
-def _to_others(part: str, cases: tuple[Case, ...], rules: Callable[[World], tuple[Entry, ...]]) -> tuple[Case, ...]:
-    """The same histories, to rules of their own."""
-
-    def cast(world: World, _seed: int) -> tuple[Entry, ...]:
-        return rules(world)
-
-    return tuple(replace(case, name=f"{part} {case.name}", cast=cast) for case in cases)
 
 
 def play(

@@ -39,7 +39,7 @@ PUSH_START_RATIO = 0.14
 PUSH_END_RATIO = 0.92
 """No push begins so late that its move would not be seen."""
 PUSH_PERIOD_S = 15.0
-"""From push to push at least: smoothing + patience + the default cool-down, and a second to look at it."""
+"""From push to push at least: the load, and some seconds to look at what came of it."""
 PUSH_LENGTH_S = 12.0
 JITTER_S = 1.0
 
@@ -47,7 +47,7 @@ JITTER_S = 1.0
 def push_schedule(duration_s: float, seed: int, threads: int = 1) -> tuple[Injection, ...]:
     """Windows that each load the then owner: as many as fit with `PUSH_PERIOD_S`, at least two, jittered by the seed.
 
-    In a run shorter than 45 s the windows move together, and a move may then wait for the task's cool-down.
+    In a run shorter than 45 s the windows move together.
     """
     generator = random.Random(seed)
     first, last = PUSH_START_RATIO * duration_s, PUSH_END_RATIO * duration_s

@@ -44,9 +44,7 @@ TASK = "echo"
 SCHEDULING: Mapping[str, float | str] = {
     "score": "paper",
     "bonus": 0.1,
-    "patience": 0.2,
-    "cool_down_s": 0,
-    "max_moves_per_minute": 1000,
+    "price_s": 0.8,
 }
 """All nodes share one machine, and the echo needs next to nothing. By service its CPU is worth the same everywhere, and
 next to nothing while the machine is busy; what is left over still tells the nodes apart."""

@@ -5,7 +5,7 @@ Does not know: runs, figures.
 
 What the paper does not give is fixed here, once, and told in the report: the "predefined cost" is `PAPER_BONUS`, a
 decision is taken every `PAPER_PERIOD_S`, its profilers average over one second; nothing else restrains a move (no
-patience, no cool-down, no damping), and no signal is foreseen. `zsched` is the product as it comes: no setting of it is
+price, no damping). `zsched` is the product as it comes: no setting of it is
 touched.
 """
 
@@ -42,7 +42,7 @@ class Scheme:
     """One scheme.
 
     ``weights`` are (cpu, memory, network), ``None`` leaves the fleet file's; ``only`` is the number of the one
-    candidate that is left (from 0, by name); ``labels`` restricts candidates; ``scheduling``, ``link`` and
+    candidate that is left (from 0, by name); ``labels`` restricts candidates; ``scheduling`` and
     ``timing`` are laid over the fleet file's blocks; ``rule`` replaces the robots' decision rule.
     """
 
@@ -53,7 +53,6 @@ class Scheme:
     only: int | None = None
     labels: Mapping[str, str] = field(default_factory=dict)
     scheduling: Mapping[str, float | str] = field(default_factory=dict)
-    link: Mapping[str, float] = field(default_factory=dict)
     timing: Mapping[str, float] = field(default_factory=dict)
     rule: RuleName | None = None
     moves_slam: bool = False
@@ -61,8 +60,7 @@ class Scheme:
 
 
 CPU, MEMORY, BOTH, NETWORK = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, 0.5, 0.0), (0.0, 0.0, 1.0)
-_FREE: Mapping[str, float | str] = {"score": "paper", "bonus": 0.0, "patience": 0.0, "cool_down_s": 0.0}
-_AS_MEASURED = {"foresee_s": 0.0}
+_FREE: Mapping[str, float | str] = {"score": "paper", "bonus": 0.0, "price_s": 0.0}
 _TIMING = {"smoothing_s": PAPER_SMOOTHING_S, "decide_s": PAPER_PERIOD_S}
 
 
@@ -83,7 +81,6 @@ def _dyna(name: str, weights: tuple[float, float, float], says: str) -> Scheme:
         says=f"{says}; bonus {PAPER_BONUS:g}, no other restraint",
         weights=weights,
         scheduling={**_FREE, "bonus": PAPER_BONUS},
-        link=_AS_MEASURED,
         timing=_TIMING,
         rule=RuleName.UNDAMPED,
     )
@@ -97,7 +94,6 @@ def _yardstick(name: str, rule: RuleName, says: str, labels: Mapping[str, str] |
         weights=BOTH,
         labels=labels or {},
         scheduling=_FREE,
-        link=_AS_MEASURED,
         timing=_TIMING,
         rule=rule,
     )
@@ -169,8 +165,6 @@ def _lay(task: Tree, scheme: Scheme) -> None:
         task["weights"] = dict(zip(("cpu", "memory", "network"), scheme.weights, strict=True))
     if scheme.scheduling:
         task["scheduling"] = {**task.get("scheduling", {}), **scheme.scheduling}
-    if scheme.link:
-        task["link"] = {**task.get("link", {}), **scheme.link}
 
 
 def candidates_of(tree: Tree, scheme: Scheme) -> list[NodeId]:

@@ -99,7 +99,7 @@ class _Counted(Simulator):
 
 def fleet_of(tasks: int, *, exclusive: bool) -> Fleet:
     """Three robots that elect, two edges, so many tasks without a word to say."""
-    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.1, cool_down_s=0.0)
+    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.1)
     return Fleet(
         name="lab",
         timing=Timing(),

@@ -93,13 +93,13 @@ def _other_worker(rng: Random, fleet: Fleet) -> Fleet:
 
 
 def _other_score(rng: Random, fleet: Fleet) -> Fleet:
-    """Another form, with or without a deadline; a patience that is learnt or given."""
+    """Another form, with or without a deadline, and another price of a move."""
     score, deadline_ms = rng.choice(((ScoreForm.PAPER, None), (ScoreForm.SERVICE, None), (ScoreForm.SERVICE, 500.0)))
-    learns = rng.choice((False, True))
+    price_s = rng.choice((0.1, 0.3))
 
     def changed(task: TaskSpec) -> TaskSpec:
         tuning = replace(task.tuning, score=score, deadline_ms=deadline_ms)
-        return replace(task, tuning=tuning, patience=0.3 if learns else task.patience, learns_patience=learns)
+        return replace(task, tuning=tuning, price_s=price_s)
 
     return _with_task(fleet, changed)
 

@@ -419,14 +419,14 @@ def fleet_of(rng: Random) -> Fleet:
     robots, edges = ROBOTS[: rng.randint(2, 4)], EDGES[: rng.randint(1, 2)]
     names = tuple(sorted((*robots, *edges)))
     weights = Weights(cpu=0.5, memory=0.5, network=0.0)
-    tuning = Tuning(weights=weights, bonus=0.1, cool_down_s=0.0, score=ScoreForm.PAPER)
+    tuning = Tuning(weights=weights, bonus=0.1, score=ScoreForm.PAPER)
     tasks = tuple(
         TaskSpec(
             name=name,
             candidates=names,
             tuning=tuning,
             exclusive=name == "merge",
-            patience=0.1,
+            price_s=0.1,
             worker=WorkerSpec(command=("work",)),
         )
         for name in ("merge", "other")[: rng.randint(1, 2)]

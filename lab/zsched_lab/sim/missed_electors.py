@@ -13,7 +13,7 @@ import math
 import sys
 from typing import Final, NamedTuple
 
-from zsched.core.values.fleet import DEFAULT_COOL_DOWN_S, Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
 from zsched_lab.sim.simulator import CORES, Simulator
 
@@ -37,9 +37,9 @@ class Played(NamedTuple):
     """The share of the time in which somebody worked (0 to 1)."""
 
 
-def fleet_of(*, cool_down_s: float = 0.0, electors: tuple[NodeId, ...] = ELECTORS) -> Fleet:
+def fleet_of(*, electors: tuple[NodeId, ...] = ELECTORS) -> Fleet:
     """Two edges that may have the task, robots that ask for it, and electors of their own."""
-    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), cool_down_s=cool_down_s)
+    tuning = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
     return Fleet(
         name="test",
         timing=Timing(),
@@ -52,7 +52,7 @@ def fleet_of(*, cool_down_s: float = 0.0, electors: tuple[NodeId, ...] = ELECTOR
                 name=TASK,
                 candidates=EDGES,
                 tuning=tuning,
-                patience=0.1,
+                price_s=0.1,
                 worker=WorkerSpec(command=("true",)),
                 exclusive=True,
             ),
@@ -63,7 +63,6 @@ def fleet_of(*, cool_down_s: float = 0.0, electors: tuple[NodeId, ...] = ELECTOR
 
 def started(
     *,
-    cool_down_s: float = 0.0,
     electors: tuple[NodeId, ...] = ELECTORS,
     busy: tuple[NodeId, ...] = (),
     seed: int = 1,
@@ -77,7 +76,7 @@ def started(
     def load(node: NodeId, _now: float) -> tuple[float, float]:
         return CORES * (BUSY_RATIO if node in busy else IDLE_RATIO), MEMORY_MB
 
-    sim = Simulator(fleet=fleet_of(cool_down_s=cool_down_s, electors=electors), seed=seed, load=load)
+    sim = Simulator(fleet=fleet_of(electors=electors), seed=seed, load=load)
     sim.start(*[name for name in sim.machines if name != "edge2"])
     if not sim.run_until(lambda: working(sim) == "edge1", STARTED_S):
         raise RuntimeError(f"edge1 has not got the task within {STARTED_S:g} s")
@@ -101,7 +100,7 @@ def play(down_s: float, *, is_busy: bool, for_s: float = FOR_S, seed: int = 1) -
 
     ``is_busy``: edge2 is, so that the task comes back whenever it may; else the edges are alike.
     """
-    sim = started(cool_down_s=DEFAULT_COOL_DOWN_S, busy=("edge2",) if is_busy else (), seed=seed)
+    sim = started(busy=("edge2",) if is_busy else (), seed=seed)
     sim.run(5.0)
     before, began_at, seen = moves(sim), sim.now, []
     while sim.now - began_at < for_s:

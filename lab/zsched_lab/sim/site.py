@@ -108,7 +108,7 @@ def fleet_of(robots: int, edges: int, timing: Timing) -> Fleet:
             TaskSpec(
                 name=TASK,
                 candidates=tuple(name for name, kind in sorted(names.items()) if kind is NodeKind.EDGE),
-                tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.1, cool_down_s=0.0),
+                tuning=Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0), bonus=0.1),
                 worker=WorkerSpec(command=("true",)),
             ),
         ),

@@ -129,17 +129,16 @@ def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeI
     is_cold = rng.random() < 0.1
     is_exclusive = rng.random() < 0.4
     is_local = not is_exclusive and rng.random() < 0.2
-    bonus, patience = rng.choice((0.0, 0.1)), rng.choice((0.0, 0.05, 0.3))
+    bonus, price_s = rng.choice((0.0, 0.1)), rng.choice((0.0, 0.05, 0.3))
     return TaskSpec(
         name=name,
         candidates=tuple(sorted(candidates)),
         tuning=Tuning(
             weights=Weights(cpu=0.5, memory=0.5, network=0.0),
             bonus=bonus,
-            cool_down_s=rng.choice((0.0, 0.0, 2.0)),
             aggregate=rng.choice(tuple(Aggregate)),
         ),
-        patience=patience,
+        price_s=price_s,
         worker=WorkerSpec(command=("work",), standby=Standby.COLD if is_cold else Standby.WARM, start_deadline_s=3.0),
         exclusive=is_exclusive,
         on_isolation=OnIsolation.LOCAL if is_local else OnIsolation.HOLD,
@@ -149,7 +148,7 @@ def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeI
 
 
 def _leased(rng: Random, fleet: Fleet) -> Fleet:
-    """The same fleet with exclusive tasks that want to move: few candidates, electors among them, no cool-down."""
+    """The same fleet with exclusive tasks that want to move: few candidates, electors among them."""
     names, candidates = [node.name for node in fleet.nodes], set(rng.sample(fleet.electors, 1))
     candidates |= set(rng.sample(names, rng.choice((1, 2, 2))))
     while len(candidates) < 2:
@@ -158,8 +157,8 @@ def _leased(rng: Random, fleet: Fleet) -> Fleet:
         replace(
             task,
             candidates=tuple(sorted(candidates)),
-            tuning=replace(task.tuning, weights=CPU_ONLY, bonus=0.0, cool_down_s=0.0),
-            patience=0.0,
+            tuning=replace(task.tuning, weights=CPU_ONLY, bonus=0.0),
+            price_s=0.0,
             worker=replace(task.worker, standby=Standby.WARM),
             exclusive=True,
             on_isolation=OnIsolation.HOLD,

@@ -51,7 +51,7 @@ def decision() -> Decision:
         for robot in ROBOTS[:2]
     )
     spec = task_of(
-        candidates=("edge1", "edge2", "edge3"), patience=0.15, tuning=TUNING, worker=WorkerSpec(command=("merge",))
+        candidates=("edge1", "edge2", "edge3"), price_s=0.15, tuning=TUNING, worker=WorkerSpec(command=("merge",))
     )
     figures = figures_of(spec, *ROBOTS, vectors=vectors)
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
@@ -191,7 +191,7 @@ def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
     for column, (joint, bonus, penalty, total) in zip(utilities.values(), sums, strict=True):
         assert float(joint) == pytest.approx(sum(column) / len(column), abs=1e-4)
         assert float(total) == pytest.approx(float(joint) + float(bonus or 0) - float(penalty or 0), abs=2e-4)
-    assert [sum_[1:3] for sum_ in sums] == [("0.0500", ""), ("", "0.0300")]
+    assert [sum_[1:3] for sum_ in sums] == [("0.05", ""), ("", "0.03")]
     assert "silent: robot3" in text
     assert "needs 0.40 cores 250M" in text
     assert "won edge1 · robot1 for edge1" in text

@@ -356,8 +356,7 @@ def decision(value: float) -> Decision:
     column = tuple(Utility(candidate=name, value=one, cpu=one) for name, one in (("edge1", 0.1), ("edge2", value)))
     spec = task_of(
         tuning=tuning_of(cpu=1.0, memory=0.0),
-        patience=0.15,
-        learns_patience=True,
+        price_s=0.15,
         worker=WorkerSpec(command=("merge",)),
     )
     vector = UtilityVector(voter="robot1", task="merge", revision=4, utilities=column)

@@ -25,7 +25,6 @@ from zsched.core.values.words import CREATION_STEP
 TUNING: Json = {
     "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
     "bonus": 0.1,
-    "cool_down_s": 10.0,
     "aggregate": "mean",
     "score": "service",
     "deadline_ms": None,
@@ -429,9 +428,9 @@ def test_an_order_that_is_not_agreed_says_so(daemon: Daemon, outcome: str, code:
 
 
 def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> None:
-    assert run("tune", "echo", "bonus=0.3", "cool_down_s=5", "--yes").exit_code == 0
+    assert run("tune", "echo", "bonus=0.3", "aggregate=median", "--yes").exit_code == 0
     told = daemon.orders[0]["tuning"]
-    assert (told["bonus"], told["cool_down_s"], told["weights"]["cpu"]) == (0.3, 5.0, 0.5)
+    assert (told["bonus"], told["aggregate"], told["weights"]["cpu"]) == (0.3, "median", 0.5)
     daemon.status["tasks"][0]["tuning"] = {**TUNING, "bonus": 0.3}
     assert "bonus=0.3 (file: 0.1)" in run("tune", "echo").stdout
     body = json.loads(run("tune", "--json").stdout)
@@ -455,58 +454,35 @@ def test_epochs_and_revisions_are_counted_from_1_for_people_and_typed_back(daemo
 
 OWN: Json = {
     **TUNING,
-    "patience": None,
-    "max_moves_per_minute": 6,
+    "price_s": 0.3,
     "memory_floor_ratio": 0.05,
     "cpu_floor_ratio": 0.0,
     "reach": "majority",
     "nu_dbm": -80.0,
     "rho_dbm": -40.0,
     "pair": "candidate",
-    "foresee_s": 3.0,
 }
 
 
 def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemon) -> None:
     daemon.status["tasks"][0] |= {"tuning": OWN, "file_tuning": OWN}
-    result = run("tune", "echo", "patience=0.5", "max_moves_per_minute=2", "reach=all", "nu_dbm=-70", "--yes")
+    result = run("tune", "echo", "price_s=0.5", "reach=all", "nu_dbm=-70", "--yes")
     assert result.exit_code == 0, result.stderr
-    assert ["echo", "patience", "learnt", "0.5"] in [line.split() for line in result.stdout.splitlines()]
+    assert ["echo", "price_s", "0.3", "0.5"] in [line.split() for line in result.stdout.splitlines()]
     told = daemon.orders[0]["tuning"]
-    assert {key: told[key] for key in ("patience", "max_moves_per_minute", "reach", "nu_dbm")} == {
-        "patience": 0.5,
-        "max_moves_per_minute": 2,
+    assert {key: told[key] for key in ("price_s", "reach", "nu_dbm")} == {
+        "price_s": 0.5,
         "reach": "all",
         "nu_dbm": -70.0,
     }
-    assert not {"rho_dbm", "pair", "foresee_s", "memory_floor_ratio"} & set(told), "they follow the file"
-    daemon.status["tasks"][0]["tuning"] = {**OWN, "patience": 0.5, "reach": "all"}
-    assert "patience=0.5 (file: learnt)" in run("tune", "echo").stdout
+    assert not {"rho_dbm", "pair", "memory_floor_ratio"} & set(told), "they follow the file"
+    daemon.status["tasks"][0]["tuning"] = {**OWN, "price_s": 0.5, "reach": "all"}
+    assert "price_s=0.5 (file: 0.3)" in run("tune", "echo").stdout
     assert "reach=all (file: majority)" in run("tune", "echo").stdout
-    plan = json.loads(run("tune", "echo", "patience=null", "reach=majority", "--plan", "--json").stdout)
-    assert (faults(plan), plan["tasks"][0]["tuning"]["patience"]) == ([], None)
-    assert run("tune", "echo", "patience=null", "reach=majority", "--yes", "--revision", "7").exit_code == 0
-    assert not {"patience", "reach"} & set(daemon.orders[-1]["tuning"])
-
-
-def test_a_patience_that_nobody_has_given_goes_along_with_the_weights(daemon: Daemon) -> None:
-    """What it is by other weights than the file's is not taken for tuned, neither shown nor asked for."""
-    radio: Json = {**OWN, "weights": {"cpu": 0.5, "memory": 0.3, "network": 0.2}, "patience": 0.4}
-    daemon.status["tasks"][0] |= {"tuning": OWN, "file_tuning": OWN}
-    result = run("tune", "echo", "memory=0.3", "network=0.2", "--yes")
-    assert ["echo", "patience", "learnt", "0.4"] in [line.split() for line in result.stdout.splitlines()]
-    daemon.status["tasks"][0] |= {"tuning": radio}
-    shown = run("tune", "echo").stdout
-    assert ("patience=0.4 " in shown, "patience=0.4 (file" in shown) == (True, False)
-    for words in (["bonus=0.2"], ["patience=null"], ["network=0", "memory=0.5"], ["patience=0.4"]):
-        assert run("tune", "echo", *words, "--yes").exit_code == 0
-    assert [order["tuning"].get("patience") for order in daemon.orders] == [None] * 3, "two change nothing"
-    assert run("tune", "echo", "patience=0.4", "network=0", "memory=0.5", "--yes").exit_code == 0
-    assert daemon.orders[-1]["tuning"]["patience"] == 0.4, "by these weights it would be learnt"
-    daemon.status["tasks"][0] |= {"file_tuning": {**OWN, "patience": 0.7}}
-    assert "patience=0.4 (file: 0.7)" in run("tune", "echo").stdout
-    assert run("tune", "echo", "bonus=0.2", "--yes").exit_code == 0
-    assert daemon.orders[-1]["tuning"]["patience"] == 0.4, "the file gives one, and it was tuned"
+    plan = json.loads(run("tune", "echo", "price_s=null", "reach=majority", "--plan", "--json").stdout)
+    assert (faults(plan), plan["tasks"][0]["tuning"]["price_s"]) == ([], 0.3)
+    assert run("tune", "echo", "price_s=null", "reach=majority", "--yes", "--revision", "7").exit_code == 0
+    assert not {"price_s", "reach"} & set(daemon.orders[-1]["tuning"])
 
 
 def test_signals_that_no_link_could_lie_between_are_refused(daemon: Daemon) -> None:
@@ -526,10 +502,9 @@ def test_signals_that_no_link_could_lie_between_are_refused(daemon: Daemon) -> N
         ("score=best", "one of paper, service"),
         ("cpu=70", "the weights' sum must be 1, and cpu=70 memory=0.5 network=0 make 70.5"),
         ("deadline_ms=0", "deadline_ms: 0.0"),
-        ("patience=-1", "patience: -1.0 is not in [0, 1000]"),
-        ("max_moves_per_minute=1.5", "not a whole number"),
+        ("price_s=-1", "price_s: -1.0 is not in [0, 1000]"),
         ("reach=some", "one of majority, all"),
-        ("paitence=1", "did you mean patience?"),
+        ("prise_s=1", "did you mean price_s?"),
     ],
 )
 def test_a_setting_that_cannot_be_is_refused_before_anybody_is_asked(daemon: Daemon, pair: str, says: str) -> None:

@@ -106,7 +106,6 @@ def test_snapshot_as_json_has_objects_for_pairs_and_null_for_what_is_not_measure
         "rssi_dbm": None,
         "bitrate_mbps": None,
         "retry_ratio": None,
-        "trend_db_s": None,
     }
     (task,) = body["tasks"]
     assert task["decision"]["utilities"]["robot1"]["edge1"]["value"] == 0.6
@@ -183,13 +182,12 @@ def test_more_robots_than_fit_are_counted() -> None:
     assert f"+{20 - shown}" in head
 
 
-def test_the_scheduler_shows_patience_where_the_daemon_tells_it() -> None:
+def test_the_scheduler_shows_what_a_move_costs_where_the_daemon_tells_it() -> None:
     status = recorded("healthy")
     (told,) = [line for line in render_status(status, 120, color=False).splitlines() if "SCHEDULER" in line]
-    status["tasks"][0]["patience"] = None
+    del status["tasks"][0]["tuning"]["price_s"]
     (untold,) = [line for line in render_status(status, 120, color=False).splitlines() if "SCHEDULER" in line]
-    assert "patience" not in untold
-    assert told.replace(" · patience 0.2", "") == untold != told
+    assert told.replace(" · a move costs 0.2 s", "") == untold != told
 
 
 def test_bonus_and_penalty_stand_beside_the_candidate_they_change() -> None:

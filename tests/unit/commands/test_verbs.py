@@ -94,11 +94,11 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
     [
         (
             "{}",
-            ["share of its work", "more than 0.05 (bonus)", "learns (0.05 to 1.5 s of its work)", "stays at least 2 s"],
+            ["share of its work", "counts 0.05 more (bonus)", "owes 0.3 s more (price_s)"],
         ),
-        ("{patience: 0.7}", ["staying has cost 0.7 s of its work (patience)"]),
-        ("{score: paper}", ["Eq. 1 and 2", "0.55 utility seconds", "less than 5 % of its memory free is left at once"]),
-        ("{max_moves_per_minute: 9, reach: all, aggregate: median}", ["9 times", "all robots reach", "median decides"]),
+        ("{price_s: 0.7}", ["owes 0.7 s more (price_s)"]),
+        ("{score: paper}", ["Eq. 1 and 2", "less than 5 % of its memory free is left at once"]),
+        ("{reach: all, aggregate: median}", ["6 times", "all robots reach", "median decides"]),
         (
             "{objective: latency, deadline_ms: 80}",
             ["of the work that it gets done there the share counts that is expected within 80 ms"],
@@ -125,14 +125,14 @@ def test_check_says_once_what_holds_for_several_tasks(tmp_path: Path) -> None:
     (name,) = (line.strip(" :") for line in task.splitlines() if line.startswith("  ") and line[2] != " ")
     tasks = {one: task.replace(name, one) for one in names}
     weights = next(line for line in tasks["other"].splitlines() if "weights:" in line)
-    tasks["other"] = tasks["other"].replace(weights, f"{weights}\n    scheduling: {{patience: 0.7}}")
+    tasks["other"] = tasks["other"].replace(weights, f"{weights}\n    scheduling: {{price_s: 0.7}}")
     file.write_text(f"{head}tasks:\n" + "".join(text.rstrip() + "\n" for text in tasks.values()))
     lines = run("check", file, "-v").stdout.splitlines()
     assert [line.split(": a machine")[0] for line in lines if "a machine is worth" in line] == [
         "tasks alike, also",
         "other",
     ], lines
-    assert len([line for line in lines if "after a move it stays" in line]) == 2
+    assert len([line for line in lines if "it moves to the machine that owes least" in line]) == 2
 
 
 def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_78(tmp_path: Path) -> None:

@@ -57,13 +57,13 @@ def test_the_same_file_and_other_comments_are_no_change() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("cool_down_s: 2}", "cool_down_s: 2.0}", (f"{RULES}.cool_down_s", "2", "2.0", "nothing notices")),
+        ("price_s: 0.3}", "price_s: 0.30}", (f"{RULES}.price_s", "0.3", "0.30", "nothing notices")),
         ("timing: wifi", "timing: {profile: wifi}", ("timing", "wifi", "{profile: wifi}", "nothing notices")),
-        ("cool_down_s: 2}", "cool_down_s: 4}", (f"{RULES}.cool_down_s", "2", "4", "takes effect at once")),
-        (", cool_down_s: 2}", "}", (f"{RULES}.cool_down_s", "2", None, "nothing notices")),
+        ("price_s: 0.3}", "price_s: 4}", (f"{RULES}.price_s", "0.3", "4", "takes effect at once")),
+        (", price_s: 0.3}", "}", (f"{RULES}.price_s", "0.3", None, "nothing notices")),
         (
-            "cool_down_s: 2}",
-            "cool_down_s: 2, reach: all}",
+            "price_s: 0.3}",
+            "price_s: 0.3, reach: all}",
             (f"{RULES}.reach", "majority", "all", "takes effect at once"),
         ),
         ("bonus: 0.05, ", "", (f"{RULES}.bonus", "0.05", None, "nothing notices")),
@@ -155,7 +155,7 @@ def test_workers_take_a_new_process_for_all_that_a_process_keeps() -> None:
         ("nodes.robot4.listen.streams", text),
         ("nodes.robot4.labels", "takes effect at once"),
     ]
-    late = with_("cool_down_s: 2}", "cool_down_s: 2, objective: latency, deadline_ms: 80}")
+    late = with_("price_s: 0.3}", "price_s: 0.3, objective: latency, deadline_ms: 80}")
     (told,) = (one for one in changes(late) if one.path.endswith("deadline_ms"))
     assert (told.effect, told.after) == (Effect.WORKERS, "80")
     assert not [one.path for one in changes(late) if one.effect is Effect.NOTHING]
@@ -249,9 +249,9 @@ def test_changes_of_sessions_need_a_restart_of_the_daemons_that_have_them() -> N
 def test_electors_change_only_where_the_file_names_them_or_has_them_no_more() -> None:
     """The fleet may have changed them by itself since: a file that names none does not mean to take that back."""
     agreed = ("edge1", "robot1", "robot2")
-    new = with_("cool_down_s: 2}", "cool_down_s: 3}")
+    new = with_("price_s: 0.3}", "price_s: 3}")
     assert [one.path for one in difference(fleet_of(TEXT), fleet_of(new), (TEXT, new), {}, agreed)] == [
-        f"{RULES}.cool_down_s"
+        f"{RULES}.price_s"
     ]
     named = f"{new}electorate: [edge2, robot1, robot2]\n"
     found = difference(fleet_of(TEXT), fleet_of(named), (TEXT, named), {}, agreed)
@@ -300,7 +300,7 @@ def test_no_field_of_a_fleet_changes_unnoticed() -> None:
     old = fleet_of(TEXT)
     fleets = differing(old, "name", "nodes", "tasks", "electors")
     task, rest = old.tasks[0], old.tasks[1:]
-    tasks: list[TaskSpec] = differing(task, "name", "rules")
+    tasks: list[TaskSpec] = differing(task, "name", "rules", "max_moves_per_minute")
     fleets += [replace(old, tasks=(one, *rest)) for one in tasks]
     node = old.nodes[0]
     nodes: list[NodeSpec] = differing(replace(node, links=(), labels=()), "name", "kind", "links", "labels")
@@ -371,7 +371,7 @@ def test_it_is_said_that_daemons_begin_again_where_they_do_and_nowhere_else() ->
     old = fleet_of(SECURED)
     (task, *rest), nodes = old.tasks, old.nodes
     variants: list[Fleet] = differing(old, "name", "nodes", "tasks", "electors")
-    variants += [replace(old, tasks=(one, *rest)) for one in differing(task, "name", "rules")]
+    variants += [replace(old, tasks=(one, *rest)) for one in differing(task, "name", "rules", "max_moves_per_minute")]
     for at, rule in enumerate(task.rules):
         rules = [(*task.rules[:at], one, *task.rules[at + 1 :]) for one in differing(rule)]
         variants += [replace(old, tasks=(replace(task, rules=one), *rest)) for one in rules]

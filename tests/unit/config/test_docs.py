@@ -8,15 +8,11 @@ import pytest
 
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
-from zsched.config.schema import LINK_LIMITS, SCHEDULING, reference
+from zsched.config.schema import SCHEDULING, reference
 from zsched.config.timing import _RELATIONS
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
-    DEFAULT_COOL_DOWN_S,
-    DEFAULT_FORESEE_S,
     DEFAULT_SCORE,
-    PAPER_PATIENCE,
-    RADIO_PATIENCE,
 )
 from zsched.core.values.model import Tuning
 
@@ -31,13 +27,9 @@ def test_reference_is_the_schemas() -> None:
 
 def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     assert SCHEDULING.items["bonus"].default == f"`{DEFAULT_BONUS:g}`"
-    assert SCHEDULING.items["cool_down_s"].default == f"`{DEFAULT_COOL_DOWN_S:g}`"
     aggregate = next(field.default for field in fields(Tuning) if field.name == "aggregate")
     assert SCHEDULING.items["aggregate"].default == f"`{aggregate}`"
     assert SCHEDULING.items["score"].default == f"`{DEFAULT_SCORE}`"
-    radio, paper = f"`{RADIO_PATIENCE:g}` with a weight for the network", f"`{PAPER_PATIENCE:g}` with `score: paper`"
-    assert SCHEDULING.items["patience"].default == f"learnt, 0.05 to 1.5; {radio}; {paper}"
-    assert LINK_LIMITS.items["foresee_s"].default == f"`{DEFAULT_FORESEE_S:g}`"
 
 
 def test_relations_between_times_are_the_codes() -> None:

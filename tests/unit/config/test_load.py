@@ -9,18 +9,12 @@ from pathlib import Path
 import pytest
 
 from zsched.config.load import CheckResult, check_bytes, check_file, load_fleet
-from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
-    DEFAULT_COOL_DOWN_S,
-    DEFAULT_FORESEE_S,
-    PAPER_PATIENCE,
-    RADIO_PATIENCE,
     Fleet,
     LinkSpec,
     OnIsolation,
     Standby,
-    Timing,
     WorkerLink,
     electorate_hash,
     fleet_hash,
@@ -48,7 +42,7 @@ tasks:
     candidates: {kind: edge}
     weights: {cpu: 0.5, memory: 0.5, network: 0.0}
     demand: {cpu_cores: 0.4, memory_mb: 250}
-    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}
+    scheduling: {bonus: 0.10, price_s: 0.4}
     worker: {command: [python, -m, zsched.tasks.map_merge], standby: warm}
     inputs:   [{from: "{robot}/map", to: "{target}/map_merge/{robot}/map", class: latest, keep_last: 1}]
     outputs:  [{from: "{target}/map_merge/global_map", to: "{robot}/global_map", class: latest}]
@@ -150,47 +144,26 @@ def test_links_of_every_source() -> None:
     assert Path(trace.value).is_absolute()
 
 
+SCHEDULED = "    scheduling: {bonus: 0.10, price_s: 0.4}\n"
+
+
 @pytest.mark.parametrize(
-    ("scheduling", "patience", "bonus", "cool_down_s"),
+    ("scheduling", "price_s", "bonus"),
     [
-        ("", FIRST_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
-        ("{}", FIRST_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
-        ("{cool_down_s: 7}", FIRST_PATIENCE, DEFAULT_BONUS, 7.0),
-        ("{cool_down_s: 0}", FIRST_PATIENCE, DEFAULT_BONUS, 0.0),
-        ("{bonus: 0.2}", FIRST_PATIENCE, 0.2, DEFAULT_COOL_DOWN_S),
-        ("{bonus: 0}", FIRST_PATIENCE, 0.0, DEFAULT_COOL_DOWN_S),
-        ("{patience: 0.3}", 0.3, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
-        ("{patience: 0}", 0.0, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S),
-        ("{patience: 0.3, bonus: 0.2}", 0.3, 0.2, DEFAULT_COOL_DOWN_S),
+        ("", 0.3, DEFAULT_BONUS),
+        ("{bonus: 0.2}", 0.3, 0.2),
+        ("{price_s: 2}", 2.0, DEFAULT_BONUS),
+        ("{price_s: 0, bonus: 0}", 0.0, 0.0),
+        ("{score: paper}", 0.3, DEFAULT_BONUS),
     ],
 )
-def test_what_a_file_does_not_say_of_patience_bonus_and_cool_down_is_the_default(
-    scheduling: str, patience: float, bonus: float, cool_down_s: float
+def test_what_a_file_does_not_say_of_price_and_bonus_is_the_default(
+    scheduling: str, price_s: float, bonus: float
 ) -> None:
-    """docs/decisions/0021 and 0033."""
     given = f"    scheduling: {scheduling}\n" if scheduling else ""
-    task = fleet_of(swapped("    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n", given)).tasks[0]
-    assert task.patience == patience
-    assert (task.tuning.bonus, task.tuning.cool_down_s) == (bonus, cool_down_s)
-
-
-@pytest.mark.parametrize(
-    ("given", "patience", "cool_down_s"),
-    [
-        ("{bonus: 0.05}", FIRST_PATIENCE, DEFAULT_COOL_DOWN_S),
-        ("{score: service}", FIRST_PATIENCE, DEFAULT_COOL_DOWN_S),
-        ("{score: service, patience: 0.7, cool_down_s: 9}", 0.7, 9.0),
-        ("{score: paper}", PAPER_PATIENCE, DEFAULT_COOL_DOWN_S),
-    ],
-)
-def test_a_task_scored_by_service_has_its_own_defaults(given: str, patience: float, cool_down_s: float) -> None:
-    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
-    task = fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0]
-    assert (task.patience, task.tuning.cool_down_s) == (patience, cool_down_s)
-    assert task.tuning.score is (ScoreForm.PAPER if "paper" in given else ScoreForm.SERVICE)
-
-
-SCHEDULED = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
+    task = fleet_of(swapped(SCHEDULED, given)).tasks[0]
+    assert (task.price_s, task.tuning.bonus) == (price_s, bonus)
+    assert task.tuning.score is (ScoreForm.PAPER if "paper" in scheduling else ScoreForm.SERVICE)
 
 
 @pytest.mark.parametrize(
@@ -242,58 +215,15 @@ def test_a_deadline_of_a_worker_that_tells_nothing_is_worth_a_word() -> None:
     assert "judged by service, whatever the deadline" in check_bytes(foreign.encode()).report()
 
 
-@pytest.mark.parametrize("given", ["", "    scheduling: {score: service}\n"])
-def test_a_task_that_weighs_the_network_has_a_patience_that_is_not_learnt(given: str) -> None:
-    """A radio comes and goes: twice as many moves otherwise (docs/decisions/0033)."""
-    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
-    text = swapped(scheduling, given).replace("network: 0.0", "network: 0.2").replace("cpu: 0.5", "cpu: 0.3")
-    task = fleet_of(text).tasks[0]
-    assert task.tuning.weights.network > 0
-    assert (task.patience, task.tuning.cool_down_s) == (RADIO_PATIENCE, DEFAULT_COOL_DOWN_S)
-    assert not task.learns_patience
-    assert task.tuning.score is ScoreForm.SERVICE
-
-
-@pytest.mark.parametrize(
-    ("link", "foresee_s"),
-    [("", DEFAULT_FORESEE_S), ("{nu_dbm: -75}", DEFAULT_FORESEE_S), ("{foresee_s: 0}", 0.0), ("{foresee_s: 1}", 1.0)],
-)
-def test_signals_are_foreseen_unless_the_file_says_otherwise(link: str, foresee_s: float) -> None:
-    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
-    given = f"{scheduling}    link: {link}\n" if link else scheduling
-    limits = fleet_of(swapped(scheduling, given)).tasks[0].limits
-    assert limits.foresee_s == foresee_s
-    assert limits.nu_dbm == (-75.0 if "nu_dbm" in link else -80.0)
-
-
-def test_the_defaults_of_a_fleet_file_are_those_of_decisions_0021_and_0033() -> None:
-    assert (PAPER_PATIENCE, RADIO_PATIENCE, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S) == (0.55, 0.4, 0.05, 2.0)
-    assert (DEFAULT_FORESEE_S, Timing().smoothing_s) == (3.0, 0.3)
-
-
-@pytest.mark.parametrize(
-    ("given", "learns"),
-    [
-        ("{}", True),
-        ("{score: service, bonus: 0.1}", True),
-        ("{patience: 0.3}", False),
-        ("{score: paper}", False),
-    ],
-)
-def test_a_patience_is_learnt_where_the_file_gives_none(given: str, learns: bool) -> None:
-    scheduling = "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n"
-    assert fleet_of(swapped(scheduling, f"    scheduling: {given}\n")).tasks[0].learns_patience is learns
-
-
 def test_every_setting_of_a_task_arrives() -> None:
     text = swapped(
-        "    scheduling: {bonus: 0.10, patience: 0.4, cool_down_s: 10}\n    worker: {command: "
+        "    scheduling: {bonus: 0.10, price_s: 0.4}\n    worker: {command: "
         "[python, -m, zsched.tasks.map_merge], standby: warm}\n",
         """\
     scheduling:
-      {bonus: 0.2, cool_down_s: 4, aggregate: median, reach: all, memory_floor_ratio: 0.1,
-       patience: 0.3}
-    link: {nu_dbm: -75, rho_dbm: -45, pair: weaker, foresee_s: 2}
+      {bonus: 0.2, aggregate: median, reach: all, memory_floor_ratio: 0.1,
+       price_s: 0.7, memory_s: 60}
+    link: {nu_dbm: -75, rho_dbm: -45, pair: weaker}
     on_isolation: local
     drain_s: 5
     worker:
@@ -310,9 +240,9 @@ def test_every_setting_of_a_task_arrives() -> None:
 """,
     ).replace("class: latest}]", "class: reliable, depth: 99, handover: all}]")
     task = fleet_of(text).task("map_merge")
-    assert (task.tuning.bonus, task.tuning.cool_down_s) == (0.2, 4)
+    assert (task.tuning.bonus, task.price_s, task.memory_s) == (0.2, 0.7, 60)
     assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
-    assert (task.patience, task.limits.pair, task.limits.foresee_s) == (0.3, PairReading.WEAKER, 2)
+    assert task.limits.pair is PairReading.WEAKER
     assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
     worker = task.worker
@@ -672,21 +602,23 @@ def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str |
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said", "at", "instead"),
+    ("old", "new", "key", "instead"),
     [
-        ("    outputs:", "    link: {knee_dbm: -60}\n    outputs:", "any more: a knee gained", "knee_dbm", "delete it"),
-        ("    outputs:", "    link: {pair: mean}\n    outputs:", "any more: its leads", "mean}", "pair: candidate"),
-        ("patience: 0.4,", "time_to_trigger_s: 2,", "any more: a timer follows", "time_to_trigger_s", "patience: 0.3"),
-        ("bonus: 0.10,", "pays_off_in_s: 60,", "any more: it gained only where", "pays_off_in_s", "bonus: 0.2"),
+        ("price_s: 0.4", "price_s: 0.4, patience: 0.4", "patience", "price_s: 0.3"),
+        ("price_s: 0.4", "price_s: 0.4, cool_down_s: 2", "cool_down_s", "price_s: 2"),
+        ("price_s: 0.4", "price_s: 0.4, max_moves_per_minute: 9", "max_moves_per_minute", "it is 6"),
+        ("    outputs:", "    link: {foresee_s: 3}\n    outputs:", "foresee_s", "delete it"),
     ],
 )
-def test_what_fleet_files_had_once_says_that_it_is_gone_and_what_to_write(
-    old: str, new: str, said: str, at: str, instead: str
+def test_a_key_that_files_had_once_changes_nothing_and_a_warning_says_what_to_write(
+    old: str, new: str, key: str, instead: str
 ) -> None:
-    text = swapped(old, new)
-    only_fault(text, said, at)
-    (fault,) = check(text).faults
-    assert instead in fault.hint
+    """An upgrade must not take the file of a machine, or the agreed document, out of force."""
+    result = check(swapped(old, new))
+    assert result.fleet == check(GOOD).fleet
+    (warned,) = (fault for fault in result.warnings if f"no key {key!r} any more" in fault.message)
+    assert instead in warned.hint
+    assert result.fleet is not None
 
 
 def test_relay_loop_names_every_rule_with_its_place() -> None:

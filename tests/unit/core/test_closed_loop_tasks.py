@@ -24,7 +24,7 @@ from zsched.core.scheduler.decision import decide
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.usage import book
-from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Demand, Timing
+from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
 from zsched.core.values.profile import DeviceSample, WorkerState
 
@@ -93,15 +93,13 @@ class Tasks:
     ) -> None:
         self.machines = {f"edge{number}": machine for number, machine in enumerate(machines, 1)}
         self.works = {f"task{number}": work for number, work in enumerate(works, 1)}
-        tuning = Tuning(weights=weights, score=ScoreForm.SERVICE, bonus=DEFAULT_BONUS, cool_down_s=DEFAULT_COOL_DOWN_S)
+        tuning = Tuning(weights=weights, score=ScoreForm.SERVICE, bonus=DEFAULT_BONUS)
         self.specs = {
             name: task_of(
                 name,
                 candidates=tuple(self.machines),
                 tuning=replace(tuning, deadline_ms=work.deadline_ms),
                 demand=Demand(cpu_cores=work.demand_cores),
-                patience=PAPER_PATIENCE,
-                learns_patience=True,
             )
             for name, work in self.works.items()
         }
@@ -222,7 +220,6 @@ class Tasks:
             now=now,
             allocation=allocation,
             vectors=(vector,),
-            settled_for_s=now - self.settled_at[name],
             owner_profile=self.gateway.fresh(allocation.owner, now),
             is_called=is_called,
         )
@@ -295,14 +292,14 @@ TAKES_THE_REST = (
 def test_where_nothing_changes_several_tasks_come_to_rest(
     fleet: tuple[tuple[Machine, ...], tuple[Work, ...], tuple[int, ...]], weights: Weights
 ) -> None:
-    """Each may go once to each machine, to learn what it gets there.
+    """Each may go once to each machine, to learn what it gets there. A slight lead may take minutes to cost a move.
 
     The examples were limit cycles of 47, 4 and 60 moves in 300 s (docs/decisions/0124).
     """
     machines, works, owners = fleet
-    moves = Tasks(machines, works, owners, weights).run(300.0)
+    moves = Tasks(machines, works, owners, weights).run(400.0)
     assert len(moves) <= len(machines) * len(works)
-    assert [at for at, _, _ in moves if at > 150.0] == []
+    assert [at for at, _, _ in moves if at > 250.0] == []
 
 
 def test_tasks_that_crowd_one_machine_spread_over_the_others() -> None:

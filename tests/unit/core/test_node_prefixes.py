@@ -35,12 +35,12 @@ APPLIED = (do.ApplyRoutes, do.SetRole, do.StartWorker, do.StopWorker, do.RecordS
 
 
 def fleet(*, exclusive: bool = False) -> Fleet:
-    tuning = tuning_of(cool_down_s=0.0)
+    tuning = tuning_of()
     task = task_of(
         TASK,
         EDGES,
         tuning=tuning,
-        patience=0.05,
+        price_s=0.05,
         worker=WorkerSpec(command=("true",)),
         drain_s=0.2,
         exclusive=exclusive,

@@ -22,7 +22,6 @@ from zsched.core.instructions import RecordStory
 from zsched.core.membership.solitude import TAKEN
 from zsched.core.node import Node
 from zsched.core.report import snapshot_json
-from zsched.core.scheduler.patience import FIRST_PATIENCE
 from zsched.core.status import build_explanation, build_snapshot, status_line
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag, FlagKind
@@ -440,27 +439,16 @@ def test_a_beat_says_whether_an_elector_has_lost_its_state(me: str, *, has_state
     assert [beat.has_lost_state for beat in sent] == [me in ROBOTS and not has_state]
 
 
-@pytest.mark.parametrize(("patience", "learns"), [(0.2, False), (FIRST_PATIENCE, True)])
-def test_a_task_says_what_staying_may_cost(patience: float, *, learns: bool) -> None:
-    node = make()
-    given = 7.0 if learns else patience
-    for task in node.rounds.tasks.values():
-        task.judge.spec = replace(task.judge.spec, patience=given, learns_patience=learns)
-    snapshot = build_snapshot(node, 100.0)
-    assert [task.patience for task in snapshot.tasks] == [patience] * 2
-    assert [task["patience"] for task in snapshot_json(snapshot)["tasks"]] == [patience] * 2
-
-
 @pytest.mark.parametrize("me", ["robot1", "edge1"])
-def test_a_tuned_patience_is_told_by_nodes_that_judge_nothing_too(me: str) -> None:
+def test_a_tuned_price_is_told_by_nodes_that_judge_nothing_too(me: str) -> None:
     node = make(me)
     value = allocation_of(5, "edge1")
-    tuned = replace(value, tuning=replace(value.tuning, patience=0.9))
+    tuned = replace(value, tuning=replace(value.tuning, price_s=0.9))
     node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(tuned,)), is_answer=True), 100.0)
-    assert {task.name: task.patience for task in build_snapshot(node, 100.0).tasks}[value.task] == 0.9
-    changed = replace(FLEET, tasks=tuple(replace(task, max_moves_per_minute=3) for task in FLEET.tasks))
+    assert {one.name: one.tuning.price_s for one in build_snapshot(node, 100.0).tasks}[value.task] == 0.9
+    changed = replace(FLEET, tasks=tuple(replace(task, memory_s=30.0) for task in FLEET.tasks))
     node.handle(ev.FleetChanged(fleet=changed), 100.1)
-    assert {task.name: task.patience for task in build_snapshot(node, 100.1).tasks}[value.task] == 0.9
+    assert {one.name: one.tuning.price_s for one in build_snapshot(node, 100.1).tasks}[value.task] == 0.9
 
 
 @pytest.mark.parametrize("deadline_ms", [None, 100.0])
@@ -1286,7 +1274,7 @@ GOLDEN = {
     "nodes[].workers[]": "task state cpu_cores memory_mb",
     "tasks[]": "name owner epoch revision since_s owner_state phase tuning candidates decision vote streams history "
     "problems",
-    "tasks[].tuning": "weights bonus cool_down_s aggregate",
+    "tasks[].tuning": "weights bonus aggregate",
     "tasks[].tuning.weights": "cpu memory network",
     "tasks[].decision": "outcome winner reason age_s aggregates utilities vetoed silent",
     "tasks[].decision.aggregates": "*",

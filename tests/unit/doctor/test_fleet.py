@@ -105,9 +105,9 @@ PIN = {"by": "eve@robot2", "reason": "", "known_s": 3.0, "for_s": None, "node": 
 
 def test_what_each_file_says_of_a_task_is_no_register(tmp_path: Path) -> None:
     """The status tells a tuning as it is in force: with what it leaves to that node's file."""
-    scene = register(tuning={"bonus": 9, "max_moves_per_minute": 6, "rho_dbm": -40.0})(fleet_scene(tmp_path), "robot1")
+    scene = register(tuning={"bonus": 9, "price_s": 0.3, "rho_dbm": -40.0})(fleet_scene(tmp_path), "robot1")
     for node in sorted(scene.statuses.keys() - {"robot1"}):
-        scene = register(tuning={"bonus": 9, "max_moves_per_minute": 10, "rho_dbm": -50.0})(scene, node)
+        scene = register(tuning={"bonus": 9, "price_s": 1.0, "rho_dbm": -50.0})(scene, node)
     assert not differs(scene.statuses)
     assert run("fleet.registers", scene).verdict is PASS
 

@@ -105,7 +105,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "speed": (0.001, 1000.0),
     "deadline_ms": (1.0, 3.6e6),
     "for_s": (1.0, model.MAX_FOR_S),
-    "max_moves_per_minute": (1, model.MAX_MOVES_PER_MINUTE),
+    "price_s": (0.0, model.MAX_PRICE_S),
     "memory_floor_ratio": (0.0, model.MAX_FLOOR),
     "cpu_floor_ratio": (0.0, model.MAX_FLOOR),
     "nu_dbm": (-120.0, 0.0),

@@ -25,7 +25,6 @@ from zsched.core.values.profile import (
     MAX_CPU_CORES,
     MAX_MEMORY_MB,
     MAX_RUNNABLE,
-    MAX_TREND_DB_S,
     DeviceSample,
     Echo,
     Link,
@@ -58,7 +57,7 @@ RSSI_IMPOSSIBLE_BELOW_DBM = -100.0
 """A lower reading is dropped."""
 RSSI_OUTLIER_DB = 25.0
 SIGNAL_SMOOTHING_S = 0.5
-"""Least time constant of a signal: readings scatter by 2.5 to 2.9 dB, and trends are taken from them."""
+"""Least time constant of a signal: readings scatter by 2.5 to 2.9 dB."""
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
 NO_REASONS: Mapping[TaskId, str] = {}
@@ -68,11 +67,10 @@ NO_RENEWALS: Mapping[TaskId, Renewal] = {}
 class SignalFilter:
     """Drops impossible values and outliers of one radio link, and smooths the rest in dBm."""
 
-    __slots__ = ("_mean", "_mean_of_means", "_recent", "_valid_at", "dropped")
+    __slots__ = ("_mean", "_recent", "_valid_at", "dropped")
 
     def __init__(self, tau_s: float) -> None:
         self._mean = Ewma(tau_s)
-        self._mean_of_means = Ewma(tau_s)
         self._recent: deque[float] = deque(maxlen=RSSI_WINDOW)
         self._valid_at = -math.inf
         self.dropped = 0
@@ -81,29 +79,16 @@ class SignalFilter:
         """Take one reading in; the smoothed signal in dBm, or ``None`` without a reading for `STALE_S`."""
         if rssi_dbm is not None and self._is_plausible(rssi_dbm):
             self._valid_at = now
-            self._mean_of_means.update(self._mean.update(rssi_dbm, now), now)
+            self._mean.update(rssi_dbm, now)
         elif rssi_dbm is not None:
             self.dropped += 1
         if now - self._valid_at > STALE_S:
-            self._mean.value = self._mean_of_means.value = None
+            self._mean.value = None
         return self._mean.value
 
     def retune(self, tau_s: float) -> None:
-        """Go on with another time constant; the trend begins anew, for it is told from how far both means lag."""
-        if tau_s != self._mean.tau_s:
-            self._mean.tau_s = self._mean_of_means.tau_s = tau_s
-            self._mean_of_means.value = self._mean.value
-
-    @property
-    def trend_db_s(self) -> float | None:
-        """How fast the smoothed signal changes, in dB per second (Brown 1956); ``None`` without a signal.
-
-        On a ramp a mean lags by the time constant, and the mean of the means by twice that.
-        """
-        once, twice, tau_s = self._mean.value, self._mean_of_means.value, self._mean.tau_s
-        if once is None or twice is None or tau_s <= 0.0:
-            return None
-        return min(max((once - twice) / tau_s, -MAX_TREND_DB_S), MAX_TREND_DB_S)
+        """Go on with another time constant."""
+        self._mean.tau_s = tau_s
 
     def _is_plausible(self, rssi_dbm: float) -> bool:
         if not RSSI_IMPOSSIBLE_BELOW_DBM < rssi_dbm <= RSSI_IMPOSSIBLE_ABOVE_DBM:
@@ -195,20 +180,18 @@ class Profiler:
             self._jobs[task].end()
 
     def _link(self, sample: LinkSample, now: float) -> Link:
-        rssi = trend = None
+        rssi = None
         if sample.source is LinkSource.FIXED:  # the file's word, and no reading: nothing in it is an outlier
-            rssi, trend = sample.rssi_dbm, None if sample.rssi_dbm is None else 0.0
+            rssi = sample.rssi_dbm
         elif sample.source is not LinkSource.WIRED:
             signal = self._signals.setdefault(sample.peer, SignalFilter(_signal_tau_s(self._timing)))
             rssi = signal.update(sample.rssi_dbm, now)
-            trend = signal.trend_db_s
         return Link(
             source=sample.source,
             peer=sample.peer,
             rssi_dbm=rssi,
             bitrate_mbps=_possible(sample.bitrate_mbps, MAX_BITRATE_MBPS),
             retry_ratio=_possible(sample.retry_ratio, 1.0),
-            trend_db_s=trend,
         )
 
     def _worker(self, load: WorkerLoad) -> WorkerLoad:

@@ -44,7 +44,7 @@ class Sampling(Struct):
 
         Args:
             device: it.
-            links: its links. A radio is measured often at all times: its trend is taken from single readings.
+            links: its links. A radio is measured often at all times.
             now: monotonic seconds.
             is_watched: the clocks must be compared often, for an exclusive task.
         """

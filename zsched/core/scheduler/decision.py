@@ -32,9 +32,8 @@ class Decided(Struct, frozen=True, kw_only=True):
     """Why the owner is to be left, by an escape or by an operator's drain."""
     needed: int
     """How many robots' utilities this decision needs."""
-    spent: float
-    """What staying has cost by now, of the patience."""
-    patience: float
+    expected: Mapping[NodeId, float]
+    """{who can have the task: seconds of work that it owes, with what it will lose}."""
     takes_turns: bool = False
     """It waits for other tasks' moves: a planned one, or a flight from short memory."""
     is_waiting_its_turn: bool = False
@@ -75,7 +74,6 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
         judgement = judge.judge(
             standing,
             allocation,
-            settled_for_s=figures.settled_for_s,
             escape=escape,
             drained=figures.drained,
             is_called=figures.is_called,
@@ -99,8 +97,7 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
         escape=escape,
         leaving=escape or (f"{allocation.owner} is {figures.drained}" if figures.drained else None),
         needed=needed,
-        spent=judge.spent,
-        patience=judge.patience,
+        expected=judge.ledger.expected({name: 1.0 - one for name, one in judgement.aggregates.items()}),
         takes_turns=takes_turns,
         is_waiting_its_turn=is_waiting,
     )
@@ -121,8 +118,8 @@ def rules_of(spec: TaskSpec) -> Rules:
         reach=spec.reach,
         memory_floor_ratio=spec.memory_floor_ratio,
         max_moves_per_minute=spec.max_moves_per_minute,
-        patience=spec.patience,
-        learns_patience=spec.learns_patience,
+        price_s=spec.price_s,
+        memory_s=spec.memory_s,
         start_deadline_s=spec.worker.start_deadline_s,
         has_command=bool(spec.worker.command),
     )
@@ -138,8 +135,8 @@ def spec_of(figures: Figures) -> TaskSpec:
         reach=rules.reach,
         memory_floor_ratio=rules.memory_floor_ratio,
         max_moves_per_minute=rules.max_moves_per_minute,
-        patience=rules.patience,
-        learns_patience=rules.learns_patience,
+        price_s=rules.price_s,
+        memory_s=rules.memory_s,
         worker=WorkerSpec(command=("",) if rules.has_command else (), start_deadline_s=rules.start_deadline_s),
     )
 

@@ -55,6 +55,8 @@ class CandidateSum(Struct, frozen=True, kw_only=True):
     bonus: float
     penalty: float
     total: float | None
+    owed_s: float | None = None
+    """Seconds of work that the task owes there, with what it will lose; ``None``: it cannot have it."""
     why_not: str = ""
     """Why it cannot have the task, or must be left."""
     need_cpu_cores: float | None = None
@@ -75,9 +77,8 @@ class Explained(Struct, frozen=True, kw_only=True):
     reason: str
     is_escape: bool
     tuning: Tuning
-    patience: float
-    spent: float
-    """What staying has cost, of the patience."""
+    price_s: float
+    """What a move costs, in seconds of the task's work."""
     known_for_s: float
     """For how long this robot has known the owner."""
     heard: tuple[NodeId, ...]
@@ -150,8 +151,7 @@ def explained(decision: Decision) -> Explained:
         reason=verdict.reason,
         is_escape=verdict.is_escape,
         tuning=allocation.tuning,
-        patience=again.patience,
-        spent=again.spent,
+        price_s=figures.rules.price_s,
         known_for_s=figures.settled_for_s,
         heard=heard,
         silent=tuple(voter for voter in figures.voters if voter not in heard),
@@ -231,6 +231,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
                 bonus=bonus,
                 penalty=penalty,
                 total=None if is_out or joint is None else max(joint + bonus - penalty, 0.0),
+                owed_s=again.expected.get(name),
                 why_not=again.leaving or "" if is_left else standing.vetoed.get(name, ""),
                 need_cpu_cores=None if need is None else need.cpu_cores,
                 need_memory_mb=None if need is None else need.memory_mb,
@@ -313,19 +314,15 @@ def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[C
             if level is not None:
                 yield f"{way} cpu term of {owner.node} would have to fall below {level:.4f} at every robot"
         elif not number:
-            yield from _times(figures, again, one.node, one.total - owner.total)
+            yield from _times(figures, again, one.node, owner.node)
 
 
-def _times(figures: Figures, again: Decided, node: NodeId, lead: float) -> Iterator[str]:
-    """What ``node``, which leads, still waits for."""
-    tuning = figures.allocation.tuning
-    left_s = tuning.cool_down_s - figures.settled_for_s
-    yield f"{node} leads by {lead:.4f} and must go on leading:"
-    if left_s > 0.0:
-        yield f"until the cool-down ends, in {left_s:.1f} s"
-    if again.spent < again.patience:
-        missing = again.patience - again.spent
-        yield f"until staying has cost {again.patience:g}, {missing:.4f} more: in {missing / lead:.1f} s by this lead"
+def _times(figures: Figures, again: Decided, node: NodeId, owner: NodeId) -> Iterator[str]:
+    """What ``node``, which owes less than the ``owner``, still waits for."""
+    more_s, price_s = again.expected[owner] - again.expected[node], figures.rules.price_s
+    yield f"{owner} owes {more_s:.2f} s more than {node}, and must go on losing:"
+    if more_s < price_s:
+        yield f"until that is the price of a move, {price_s:g} s"
     if figures.first is not None:
         yield f"until {figures.first} has moved"
     electors, heard = len(figures.electors), len(figures.electors_heard)

@@ -1,7 +1,7 @@
 """SCHEDULER, second half: from a standing to a proposal, with stickiness.
 
-Knows: bonus, patience, cool-down, escapes, an operator's pause and pin. Does not know: how utilities were computed or
-travel, who else proposes what, how anything is committed.
+Knows: bonus, escapes, an operator's pause and pin. Does not know: how utilities were computed or travel, what is owed
+(`zsched.core.scheduler.ledger`), who else proposes what, how anything is committed.
 
 `Judge` keeps the little memory that stickiness needs, per task, and turns a `Standing` into a `Judgement`: a candidate
 to propose, or the owner, always with the reason.
@@ -17,8 +17,8 @@ from typing import Final
 
 from zsched.core.absence import Absences
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
-from zsched.core.scheduler.patience import LONGEST_GAP_S, LearntPatience, spend
-from zsched.core.scheduler.standing import LOST_S, Standing, joined, pick
+from zsched.core.scheduler.ledger import Ledger
+from zsched.core.scheduler.standing import LOST_S, Standing, joined, rounded
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
@@ -26,14 +26,14 @@ from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import CLOCK_IN_DOUBT, HAS_RESTED, TOO_FEW_ELECTORS, told_of_worker
 
+FIT_S: Final = 2.0
+"""A task goes home to the node that it is pinned to once that could have had it for so long."""
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
 _LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, HAS_RESTED)
 """First words of vetoes by which an owner's exclusive worker cannot be at work for long."""
 FORGIVEN_RATIO: Final = 0.1
 """An owner's worker that is ready makes up so much of the time in which it was not."""
-UNSCORED_S = 2.0
-"""An owner that cannot be scored is left after this time: nobody knows the cost of staying there."""
 
 
 def _of_worker(since: float | None = None, total_s: float = 0.0, back_at: float | None = None) -> Absences:
@@ -66,17 +66,11 @@ class Judge:
     """The memory of one task's stickiness at one robot."""
 
     spec: TaskSpec
-    unscored: Absences = dataclasses.field(default_factory=Absences)
-    """Of the owner's score, while somebody else could be scored."""
     absences: Absences = dataclasses.field(default_factory=_of_worker)
     """Of the owner's worker that is ready."""
     lost: Absences = dataclasses.field(default_factory=Absences)
     """Of the owner from where the robots reach."""
-    spent: float = 0.0
-    """What staying has cost so far, in utility seconds."""
-    spent_at: float | None = None
-    learnt: LearntPatience = dataclasses.field(default_factory=LearntPatience)
-    """Of a task that learns its patience."""
+    ledger: Ledger = dataclasses.field(default_factory=Ledger)
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
@@ -86,16 +80,15 @@ class Judge:
     out: AbstractSet[NodeId] = frozenset()
     """The candidates that a first placement does not wait for: they cannot have the task."""
 
-    @property
-    def patience(self) -> float:
-        """What staying may cost now, in utility seconds."""
-        return self.learnt.value if self.spec.learns_patience else self.spec.patience
-
     def reset(self, *, is_new_owner: bool = False) -> None:
-        """A vote was lost or the value changed: what staying has cost counts from nothing again."""
-        self.unscored, self.spent, self.fit_since = Absences(), 0.0, None
+        """The value changed; what is owed stays."""
+        self.fit_since = None
         if is_new_owner:
             self.lost, self.absences = Absences(), _of_worker()
+
+    def forgive(self) -> None:
+        """A vote was lost: the others see nothing of it, and what is owed is forgotten; else each round had a vote."""
+        self.fit_since, self.ledger = None, Ledger(at=self.ledger.at)
 
     def by(self, spec: TaskSpec) -> None:
         """Judge by other settings; by another start-up time what was away in the one before does not count."""
@@ -107,7 +100,7 @@ class Judge:
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
 
-        A worker that is started anew on purpose, once or twice, takes nobody's patience; one that is ready now and then
+        A worker that is started anew on purpose, once or twice, is waited for; one that is ready now and then
         is left once its absences are longer than a start-up (`zsched.core.absence`).
         """
         if profile is None:
@@ -133,42 +126,31 @@ class Judge:
 
     def memory(self) -> JudgeMemory:
         """What this judge remembers, as a value."""
-        players, watched_at = self.learnt.memory() if self.spec.learns_patience else ((), None)
         return JudgeMemory(
-            unscored_since=self.unscored.since,
-            unscored_s=self.unscored.total_s,
-            scored_at=self.unscored.back_at,
+            owed=tuple(sorted(self.ledger.owed.items())),
+            charged_at=self.ledger.at,
             not_ready_since=self.absences.since,
             away_s=self.absences.total_s,
             away_until=self.absences.back_at,
             lost_since=self.lost.since,
             lost_s=self.lost.total_s,
             reached_at=self.lost.back_at,
-            spent=self.spent,
-            spent_at=self.spent_at,
             seen_first_at=self.seen_first_at,
             fit_since=self.fit_since,
-            players=players,
-            watched_at=watched_at,
-            patience=self.learnt.value if self.spec.learns_patience else None,
         )
 
     def recall(self, memory: JudgeMemory) -> None:
         """Remember that, and nothing else."""
         self.lost = Absences(since=memory.lost_since, total_s=memory.lost_s, back_at=memory.reached_at)
-        self.unscored = Absences(since=memory.unscored_since, total_s=memory.unscored_s, back_at=memory.scored_at)
         self.absences = _of_worker(memory.not_ready_since, memory.away_s, memory.away_until)
-        self.spent, self.spent_at, self.seen_first_at = memory.spent, memory.spent_at, memory.seen_first_at
-        self.fit_since = memory.fit_since
-        self.learnt = LearntPatience()
-        self.learnt.recall(memory.players, memory.watched_at, memory.patience)
+        self.ledger = Ledger(owed=dict(memory.owed), at=memory.charged_at)
+        self.seen_first_at, self.fit_since = memory.seen_first_at, memory.fit_since
 
     def judge(
         self,
         standing: Standing,
         allocation: Allocation,
         *,
-        settled_for_s: float,
         escape: str | None,
         is_called: bool,
         now: float,
@@ -181,9 +163,8 @@ class Judge:
         Args:
             standing: the joint view.
             allocation: what is agreed now.
-            settled_for_s: seconds since this epoch was learnt (cool-down).
             escape: why the owner must be left at once (`escape_reason`), or ``None``.
-            is_called: another robot called a vote: answer with today's winner, without waiting for our own timers.
+            is_called: another robot called a vote: answer with who owes least, whatever a move costs.
             now: monotonic seconds.
             damping: the task's record of moves, for the cap and the penalties (those that other robots remember, in
                 ``standing``, count as well); ``None``: neither.
@@ -191,31 +172,28 @@ class Judge:
             is_unheard: nobody here has ever heard the owner.
         """
         owner = allocation.owner
-        if self.spec.learns_patience:
-            tuning = allocation.tuning
-            self.learnt.watch(standing.aggregates, tuning.bonus, tuning.cool_down_s, now)
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
-        bonus = allocation.tuning.bonus if leaving is None else 0.0
         penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
-        scored = {
-            name: max(value + (bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
+        worth = {
+            name: max(value + (allocation.tuning.bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
             for name, value in standing.aggregates.items()
-            if leaving is None or name != owner
         }
         home = allocation.home
-        if allocation.is_bound:
-            scored = {name: value for name, value in scored.items() if name in (home, owner)}
+        scored = {
+            name: value
+            for name, value in worth.items()
+            if (leaving is None or name != owner) and (not allocation.is_bound or name in (home, owner))
+        }
         self._watch_home(home in scored and home != owner, now)
-        winner = home if home is not None and home in scored else pick(scored, owner)
+        owed = self._charge(worth, owner, now)
+        expected = {name: owed[name] for name in scored}
+        winner = home if home is not None and home in scored else least_of(expected, owner)
         if winner is None:
-            self.unscored.look(is_away=False, now=now, limit_s=UNSCORED_S)
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
-        if not is_drain:
-            self._spend(scored, owner, now, is_scored=owner in standing.aggregates)
         is_kept = allocation.home is not None and not (is_unheard and winner != allocation.home)
-        outcome, reason = self._outcome(winner, scored, allocation, settled_for_s, leaving, is_called, now, is_kept)
+        outcome, reason = self._outcome(winner, expected, allocation, leaving, is_called, now, is_kept)
         cap = None
         if damping is not None and owner is not None and not is_drain:
             cap = self._cap(damping, is_escape=escape is not None, now=now)
@@ -238,18 +216,12 @@ class Judge:
         elif self.fit_since is None:
             self.fit_since = now
 
-    def _spend(self, scored: Mapping[NodeId, float], owner: NodeId | None, now: float, *, is_scored: bool) -> None:
-        """Add up the lead over the owner with its bonus, over time (`zsched.core.scheduler.patience.spend`).
-
-        ``is_scored``: the owner is, though it may be left for something else.
-        """
-        self.unscored.look(not is_scored, now, UNSCORED_S)
-        if owner is None or owner not in scored:
-            self.spent, self.spent_at = 0.0 if owner is None else self.spent, None
-            return
-        elapsed_s = 0.0 if self.spent_at is None else min(now - self.spent_at, LONGEST_GAP_S)
-        self.spent = spend(self.spent, max(scored.values()) - scored[owner], self.patience, elapsed_s)
-        self.spent_at = now
+    def _charge(self, worth: Mapping[NodeId, float], owner: NodeId | None, now: float) -> dict[NodeId, float]:
+        """Charge everybody; {machine: what it owes, with what it will lose}. One without a worth loses all."""
+        names = {*self.spec.candidates, *worth, *(() if owner is None else (owner,))}
+        losses = {name: 1.0 - worth.get(name, 0.0) for name in sorted(names)}
+        self.ledger.charge(losses, owner, price_s=self.spec.price_s, memory_s=self.spec.memory_s, now=now)
+        return self.ledger.expected(losses)
 
     def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
         """Why no further move is allowed in this minute, or ``None``."""
@@ -260,47 +232,42 @@ class Judge:
     def _outcome(
         self,
         winner: NodeId,
-        scored: Mapping[NodeId, float],
+        expected: Mapping[NodeId, float],
         allocation: Allocation,
-        settled_for_s: float,
         leaving: str | None,
         is_called: bool,
         now: float,
         is_kept: bool,
     ) -> tuple[Outcome, str]:
         """``is_kept``: by a pin, which holds no task on a machine that has never been heard."""
-        owner, tuning = allocation.owner, allocation.tuning
+        owner = allocation.owner
         if allocation.paused:
             return Outcome.STAY, f"paused by {by(allocation.pause)}"
         if owner is None:
             if winner == allocation.home:
                 return Outcome.PROPOSE, f"first placement: pinned to {winner} by {by(allocation.pin)}"
-            return self._initial(winner, scored, is_called=is_called, now=now)
+            return self._initial(winner, expected, is_called=is_called, now=now)
         if leaving is not None:
             return Outcome.PROPOSE, leaving
         if is_kept:
-            return self._pinned(winner, allocation, settled_for_s, is_called, now)
+            return self._pinned(winner, allocation, is_called, now)
         if winner == owner:
             return Outcome.STAY, "nobody better"
-        lead = scored[winner] - scored.get(owner, 0.0)
-        why = f"{winner} leads by {lead:.3f} over {owner} with its bonus"
+        if owner in expected:
+            more_s = expected[owner] - expected[winner]
+            why = f"{owner} owes {more_s:.2f} s more than {winner}"
+        else:
+            more_s = self.ledger.owed.get(owner, 0.0) - self.ledger.owed.get(winner, 0.0)
+            why = f"{owner} cannot be scored, and owes {more_s:.2f} s more than {winner}"
+        price_s = self.spec.price_s
         if is_called:
             return Outcome.PROPOSE, f"vote called; {why}"
-        if settled_for_s < tuning.cool_down_s:
-            return Outcome.WAIT, f"{why}; cool-down {settled_for_s:.1f} of {tuning.cool_down_s:g} s"
-        if owner not in scored:
-            assert self.unscored.since is not None
-            held_s, unscored_s = self.unscored.held_s(UNSCORED_S), now - self.unscored.since
-            for_long = f"{owner} cannot be scored, for {unscored_s - held_s:.1f} of {UNSCORED_S - held_s:.3g} s"
-            return (Outcome.PROPOSE if unscored_s >= UNSCORED_S else Outcome.WAIT), for_long
-        if self.spent < self.patience:
-            return Outcome.WAIT, f"{why}; staying has cost {self.spent:.3f} of {self.patience:g}"
-        return Outcome.PROPOSE, f"{why}; staying has cost {self.patience:g}"
+        if more_s < price_s:
+            return Outcome.WAIT, f"{why}; a move costs {price_s:g} s"
+        return Outcome.PROPOSE, why
 
-    def _pinned(
-        self, winner: NodeId, allocation: Allocation, settled_for_s: float, is_called: bool, now: float
-    ) -> tuple[Outcome, str]:
-        """No voluntary moves; but the task goes to the node it is pinned to, once that is fit for the cool-down."""
+    def _pinned(self, winner: NodeId, allocation: Allocation, is_called: bool, now: float) -> tuple[Outcome, str]:
+        """No voluntary moves; but the task goes to the node it is pinned to, once that could have had it for a time."""
         home, owner = allocation.home, allocation.owner
         told = f"pinned to {home} by {by(allocation.pin)}"
         if home == owner:
@@ -309,20 +276,25 @@ class Judge:
             return Outcome.STAY, f"{told}, which cannot have it now"
         if is_called:
             return Outcome.PROPOSE, told
-        fit_s = min(0.0 if self.fit_since is None else now - self.fit_since, settled_for_s)
-        told = f"{told}, fit for {fit_s:.1f} of {allocation.tuning.cool_down_s:g} s"
-        return (Outcome.PROPOSE if fit_s >= allocation.tuning.cool_down_s else Outcome.WAIT), told
+        fit_s = 0.0 if self.fit_since is None else now - self.fit_since
+        told = f"{told}, fit for {fit_s:.1f} of {FIT_S:g} s"
+        return (Outcome.PROPOSE if fit_s >= FIT_S else Outcome.WAIT), told
 
     def _initial(
-        self, winner: NodeId, scored: Mapping[NodeId, float], *, is_called: bool, now: float
+        self, winner: NodeId, expected: Mapping[NodeId, float], *, is_called: bool, now: float
     ) -> tuple[Outcome, str]:
         if self.seen_first_at is None:
             self.seen_first_at = now
         waited = now - self.seen_first_at
-        missing = [name for name in self.spec.candidates if name not in scored and name not in self.out]
+        missing = [name for name in self.spec.candidates if name not in expected and name not in self.out]
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
-        return Outcome.PROPOSE, f"first placement: {winner} has the highest utility"
+        return Outcome.PROPOSE, f"first placement: {winner} is worth most"
+
+
+def least_of(expected: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
+    """Who owes least, to 1/1024 s; of several the owner, then the lowest name."""
+    return min(expected, key=lambda name: (rounded(expected[name]), name != owner, name), default=None)
 
 
 def _nobody(allocation: Allocation, why: str) -> str:
@@ -349,7 +321,7 @@ def escape_reason(
     not_ready_for_s: float,
     held_s: float = 0.0,
 ) -> str | None:
-    """Why the owner must be left now, without patience or cool-down (but never without the quorum).
+    """Why the owner must be left now, whatever a move costs (but never without the quorum).
 
     Short memory is such a reason under the paper's score, which does not tell it from enough; `ScoreForm.SERVICE` does.
 

@@ -1,10 +1,10 @@
 """SCHEDULER, the radio: what one robot's link to one candidate is worth (Eq. 3), and how far away it counts.
 
-Knows: links that were measured directly, the two ways of a pair that meet at an access point, trends, ways that nobody
+Knows: links that were measured directly, the two ways of a pair that meet at an access point, ways that nobody
 has measured yet. Does not know: weights, who may have the task, how signals are smoothed.
 
 Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead, and
-nothing foreseen makes it so. What it is *worth* depends on the task's reading of a pair (docs/decisions/0018).
+What it is *worth* depends on the task's reading of a pair (docs/decisions/0018).
 """
 
 from __future__ import annotations
@@ -15,20 +15,11 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.utility import network_utility
 from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import NodeId, PairReading
-from zsched.core.values.profile import Link, LinkSource, Profile
+from zsched.core.values.profile import LinkSource, Profile
 from zsched.core.values.struct import Struct
 
 WIRED_DBM = 0.0
 """Stands for a cable in comparisons of signals: better than any radio."""
-FORESEE_MOST_DB = 6.0
-"""No signal is foreseen further from the measured one than this: a trend of noise must not outweigh a signal."""
-
-
-class Way(Struct, frozen=True):
-    """One way, in dBm: what is measured now, and what it will be."""
-
-    now_dbm: float
-    ahead_dbm: float
 
 
 class PairLink(Struct, frozen=True):
@@ -63,55 +54,43 @@ def pair_link(
         return PairLink(is_reached=True, utility=1.0)
     ends, nu_dbm = (gateway.fresh(voter, now), gateway.fresh(candidate, now)), limits.nu_dbm
     for end, other in ((ends[0], candidate), (ends[1], voter)):
-        direct = None if end is None else _way(end, other, limits)
-        if direct is not None:
-            signal_dbm = direct.now_dbm
+        signal_dbm = None if end is None else _way(end, other)
+        if signal_dbm is not None:
             return PairLink(
                 is_reached=signal_dbm >= nu_dbm,
-                utility=_worth(direct.ahead_dbm, limits),
+                utility=_worth(signal_dbm, limits),
                 at_limit=nu_dbm <= signal_dbm < nu_dbm + margin_db,
             )
     if ends[0] is None or ends[1] is None:
         return None
-    own, its = _way(ends[0], None, limits), _way(ends[1], None, limits)
+    own, its = _way(ends[0], None), _way(ends[1], None)
     if own is None or its is None:
         return None
-    is_reached = min(own.now_dbm, its.now_dbm) >= nu_dbm
-    is_clear = own.now_dbm >= nu_dbm + own_margin_db and its.now_dbm >= nu_dbm + margin_db
+    is_reached = min(own, its) >= nu_dbm
+    is_clear = own >= nu_dbm + own_margin_db and its >= nu_dbm + margin_db
     at_limit = is_reached and not is_clear
     return PairLink(is_reached=is_reached, utility=_joint(own, its, limits), at_limit=at_limit, is_direct=False)
 
 
-def _joint(own: Way, its: Way, limits: LinkLimits) -> float:
+def _joint(own_dbm: float, its_dbm: float, limits: LinkLimits) -> float:
     """Two ways through one access point as one utility, by the task's reading of a pair."""
     is_candidates = limits.pair is PairReading.CANDIDATE
-    return _worth(its.ahead_dbm if is_candidates else min(own.ahead_dbm, its.ahead_dbm), limits)
+    return _worth(its_dbm if is_candidates else min(own_dbm, its_dbm), limits)
 
 
 def _worth(signal_dbm: float, limits: LinkLimits) -> float:
     return network_utility(signal_dbm, limits.nu_dbm, limits.rho_dbm)
 
 
-def _way(profile: Profile, peer: NodeId | None, limits: LinkLimits) -> Way | None:
-    """A node's link to ``peer`` (``None``: to the access point or the cable); ``None`` when it measures none."""
-    for link in profile.links:
-        if link.peer != peer:
-            continue
-        if link.source is LinkSource.WIRED:
-            return Way(WIRED_DBM, WIRED_DBM)
-        return None if link.rssi_dbm is None else Way(link.rssi_dbm, foreseen(link, limits.foresee_s))
-    return None
+def _way(profile: Profile, peer: NodeId | None) -> float | None:
+    """The smoothed signal of a node's link to ``peer`` (``None``: to the access point or the cable), in dBm.
 
-
-def foreseen(link: Link, lead_s: float) -> float:
-    """A radio's smoothed signal ``lead_s`` seconds ahead along its trend, at most `FORESEE_MOST_DB` away, in dBm.
-
-    With a lead of one smoothing time constant this is Brown's double exponential smoothing (1956): on a straight ramp
-    the delay of the smoothing is gone.
+    ``None``: it measures none.
     """
-    assert link.rssi_dbm is not None
-    step_db = lead_s * (link.trend_db_s or 0.0)
-    return link.rssi_dbm + min(max(step_db, -FORESEE_MOST_DB), FORESEE_MOST_DB)
+    for link in profile.links:
+        if link.peer == peer:
+            return WIRED_DBM if link.source is LinkSource.WIRED else link.rssi_dbm
+    return None
 
 
 def ways(

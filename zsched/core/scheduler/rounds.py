@@ -6,7 +6,7 @@ becomes of a proposal (`zsched.core.vote.voting`), bytes.
 A robot judges every ``decide_s``, by the others' utilities: it gathers them, unless all is at rest
 (`zsched.core.scheduler.rest`). It gathers at once when an owner is gone or another robot's proposal
 for a move arrives: the first proposal *calls* the vote, so rounds need no synchronised clocks. In a called vote every
-robot answers with today's winner, or with the owner: its own patience and cool-down do not count, the caller's
+robot answers with today's winner, or with the owner: what a move costs does not count, the caller's
 did (docs/decisions/0004).
 """
 
@@ -454,7 +454,7 @@ class Rounds:
 
     def on_stayed(self, name: TaskId) -> None:
         """A vote has ended with: stay."""
-        self.tasks[name].judge.reset()
+        self.tasks[name].judge.forgive()
 
     def on_moved(
         self,

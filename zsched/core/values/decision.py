@@ -21,42 +21,27 @@ class Rules(Struct, frozen=True, kw_only=True):
     reach: Reach
     memory_floor_ratio: float
     max_moves_per_minute: int
-    patience: float
-    learns_patience: bool
+    price_s: float = 0.3
+    memory_s: float = 200.0
     start_deadline_s: float
     has_command: bool
     """Whether zsched starts the worker."""
 
 
-class PlayerMemory(Struct, frozen=True, kw_only=True):
-    """One patience that is played, in the order of the choices (`zsched.core.scheduler.patience`)."""
-
-    owner: NodeId | None = None
-    spent: float = 0.0
-    paid: float = 0.0
-    moved_at: float | None = None
-
-
 class JudgeMemory(Struct, frozen=True, kw_only=True):
     """The memory that a judgement begins with (`zsched.core.scheduler.judge.Judge`)."""
 
-    unscored_since: float | None = None
-    unscored_s: float = 0.0
-    scored_at: float | None = None
+    owed: tuple[tuple[NodeId, float], ...] = ()
+    """(machine, seconds of work), sorted."""
+    charged_at: float | None = None
     not_ready_since: float | None = None
     away_s: float = 0.0
     away_until: float | None = None
     lost_since: float | None = None
     lost_s: float = 0.0
     reached_at: float | None = None
-    spent: float = 0.0
-    spent_at: float | None = None
     seen_first_at: float | None = None
     fit_since: float | None = None
-    players: tuple[PlayerMemory, ...] = ()
-    watched_at: float | None = None
-    patience: float | None = None
-    """The learnt one in force; ``None``: not learnt, or from before it was kept."""
 
 
 class DampingMemory(Struct, frozen=True, kw_only=True):

@@ -21,8 +21,7 @@ from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
     MAX_FLOOR,
-    MAX_FORESEE_S,
-    MAX_MOVES_PER_MINUTE,
+    MAX_PRICE_S,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
     Allocation,
@@ -41,16 +40,8 @@ from zsched.core.values.words import Readings
 
 DEFAULT_SCORE = ScoreForm.SERVICE
 """How to score a machine when the fleet file does not say (docs/decisions/0031)."""
-PAPER_PATIENCE = 0.55
-"""Utility seconds, of a task with `ScoreForm.PAPER` whose fleet file gives no patience."""
-RADIO_PATIENCE = 0.4
-"""Patience of a task scored by service that weighs the network (docs/decisions/0134). All others learn theirs."""
 DEFAULT_BONUS = 0.05
-"""The bonus of a task whose fleet file gives none (docs/decisions/0021)."""
-DEFAULT_COOL_DOWN_S = 2.0
-"""The cool-down of a task whose fleet file gives none (docs/decisions/0033)."""
-DEFAULT_FORESEE_S = 3.0
-"""How far ahead the signals of a task count when its fleet file does not say."""
+"""The bonus of a task whose fleet file gives none."""
 FEWEST_SIGNS, MOST_SIGNS = 3, 4
 """Of life in a lease of data sessions; `zsched.config.timing` keeps ``lease_s`` short enough for the latter."""
 LEAST_ORDER_S, MOST_ORDER_S = 3.0, 60.0
@@ -64,18 +55,6 @@ MOST_PACED_S = 5.0
 """...and this long at most: one stall of a disk that is quick says nothing of the next save."""
 SECONDS = Range(0.01, 3600, "s")
 DBM = Range(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm")
-
-
-def default_patience(score: ScoreForm, network: float) -> float | None:
-    """The patience of a task whose fleet file gives none, in utility seconds; ``None``: it is learnt.
-
-    Args:
-        score: how its machines are scored.
-        network: the weight of its links, in [0, 1].
-    """
-    if score is ScoreForm.PAPER:
-        return PAPER_PATIENCE
-    return RADIO_PATIENCE if network else None
 
 
 class Standby(StrEnum):
@@ -246,18 +225,12 @@ class LinkLimits:
         PairReading.CANDIDATE,
         "Worth of a link through an access point: by the candidate's way (as printed), or by the weaker one.",
     )
-    foresee_s: float = key(
-        0.0,
-        "Signals count as they will be after this time along their trend (at most 6 dB); `0`: as they are.",
-        Range(0, MAX_FORESEE_S, "s"),
-        shown=f"`{DEFAULT_FORESEE_S:g}`",
-    )
 
 
-TASK_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "max_moves_per_minute")
+TASK_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s", "memory_s")
 """Keys of `scheduling` that are fields of `TaskSpec`, under the same name."""
-TUNED_RULES = ("patience", *TASK_RULES)
-TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair", "foresee_s")
+TUNED_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s")
+TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair")
 """Settings of a task's file that a `Tuning` may set anew: fields of `TaskSpec` and of `LinkLimits`."""
 
 
@@ -287,14 +260,15 @@ class TaskSpec:
         "there that are no tasks, such as a robot's SLAM. `0`: by what the task itself gets. Not with `score: paper`.",
         Range(0, MAX_FLOOR),
     )
-    max_moves_per_minute: int = key(
-        6, "Hard cap of planned moves; escapes are bounded too, at 60.", Range(1, MAX_MOVES_PER_MINUTE)
+    price_s: float = key(
+        0.3,
+        "What a move costs, in seconds of the task's work: it moves once staying has lost so much more than the other "
+        "machine would have. `0`: it follows the first lead that is seen.",
+        Range(0, MAX_PRICE_S, "s"),
     )
-    """Escapes: `zsched.core.scheduler.damping`."""
-    patience: float = PAPER_PATIENCE
-    """Utility seconds that staying may cost before the task moves; 0: none, the first judgement of a lead moves it."""
-    learns_patience: bool = False
-    """Its patience is learnt (`zsched.core.scheduler.patience`), and ``patience`` does not count."""
+    max_moves_per_minute: int = 6
+    """A fuse, whatever the figures say; no file sets it."""
+    memory_s: float = key(200.0, "Half of what a machine has lost is forgotten in this time.", Range(1, 86400, "s"))
     on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
     exclusive: bool = key(
         False,
@@ -319,34 +293,20 @@ class TaskSpec:
     def under(self, tuning: Tuning) -> TaskSpec:
         """This task as operators have tuned it: what they have not set is the file's.
 
-        A pair of signals that no link could lie between is left out: another node's file may be the one it fits. Where
-        the file's patience is the default one by its own weights and score, the default one by those in force counts.
+        A pair of signals that no link could lie between is left out: another node's file may be the one it fits.
         """
         own: dict[str, Any] = {name: getattr(tuning, name) for name in TUNED_RULES}
         links: dict[str, Any] = {name: getattr(tuning, name) for name in TUNED_LINKS}
-        if tuning.patience is not None:
-            own["learns_patience"] = False
-        elif self._has_default_patience:
-            own["patience"] = default_patience(tuning.score, tuning.weights.network)
-            own["learns_patience"] = own["patience"] is None
         limits = replace(self.limits, **{name: value for name, value in links.items() if value is not None})
         if limits.nu_dbm >= limits.rho_dbm:
             limits = replace(limits, nu_dbm=self.limits.nu_dbm, rho_dbm=self.limits.rho_dbm)
         return replace(self, limits=limits, **{name: value for name, value in own.items() if value is not None})
 
-    @property
-    def _has_default_patience(self) -> bool:
-        """The file gives no patience, or the one that the task would have without."""
-        given = None if self.learns_patience else self.patience
-        return given == default_patience(self.tuning.score, self.tuning.weights.network)
-
     def in_force(self, tuning: Tuning) -> Tuning:
-        """The tuning with every setting that it leaves to the file; a patience of ``None`` is learnt."""
+        """The tuning with every setting that it leaves to the file."""
         spec = self.under(tuning)
         rules = {name: getattr(spec, name) for name in TUNED_RULES}
         links = {name: getattr(spec.limits, name) for name in TUNED_LINKS}
-        if spec.learns_patience:
-            rules["patience"] = None
         return replace(tuning, **rules, **links)
 
     def first_value(self, start: int, *, is_new: bool = True) -> Allocation:

@@ -149,33 +149,29 @@ class Weights(Struct, frozen=True, kw_only=True):
 
 
 MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
-MAX_PATIENCE, MAX_MOVES_PER_MINUTE, MAX_FLOOR, MAX_FORESEE_S = 1000.0, 100_000, 0.9, 30.0
+MAX_PRICE_S, MAX_FLOOR = 1000.0, 0.9
 
 
 class Tuning(Struct, frozen=True, kw_only=True):
     """The settings that may change on the running fleet, agreed through the register like an allocation.
 
-    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1]; ``cool_down_s`` is the
-    least stay after a move.
+    ``bonus`` is added to the owner's aggregate (APPLY_COST of Alg. 2), in utility units [0, 1].
     """
 
     weights: Weights
     bonus: float = 0.10
-    cool_down_s: float = 10.0
     aggregate: Aggregate = Aggregate.MEAN
     score: ScoreForm = ScoreForm.PAPER
     deadline_ms: float | None = None
     """`Objective.LATENCY`: a job that takes longer from input to output, network included, comes too late. ``None``:
     `Objective.SERVICE`. `ScoreForm.PAPER` knows no deadlines."""
-    patience: float | None = None
+    price_s: float | None = None
     """From here on ``None``: as the fleet file says, also when the file changes."""
-    max_moves_per_minute: int | None = None
     memory_floor_ratio: float | None = None
     reach: Reach | None = None
     nu_dbm: float | None = None
     rho_dbm: float | None = None
     pair: PairReading | None = None
-    foresee_s: float | None = None
     cpu_floor_ratio: float | None = None
 
     @property
@@ -186,14 +182,11 @@ class Tuning(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
-        check_range("cool_down_s", self.cool_down_s, 0.0, 86400.0)
-        check_range("patience", self.patience, 0.0, MAX_PATIENCE)
-        check_range("max_moves_per_minute", self.max_moves_per_minute, 1, MAX_MOVES_PER_MINUTE)
+        check_range("price_s", self.price_s, 0.0, MAX_PRICE_S)
         check_range("memory_floor_ratio", self.memory_floor_ratio, 0.0, MAX_FLOOR)
         check_range("cpu_floor_ratio", self.cpu_floor_ratio, 0.0, MAX_FLOOR)
         check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
-        check_range("foresee_s", self.foresee_s, 0.0, MAX_FORESEE_S)
 
 
 class Asked(Struct, frozen=True, kw_only=True):

@@ -23,7 +23,6 @@ from zsched.core.values.words import Readings, check_range
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
 MAX_RUNNABLE = 1e6
-MAX_TREND_DB_S = 100.0
 MAX_JOBS_HZ, MAX_JOB_S = 1e6, 1e6
 MAX_HELD_S = 3600.0
 """Bounds that no machine or link exceeds: a larger figure is a fault of its sender."""
@@ -51,14 +50,11 @@ class Link(Struct, frozen=True, kw_only=True):
     rssi_dbm: float | None = None
     bitrate_mbps: float | None = None
     retry_ratio: float | None = None
-    trend_db_s: float | None = None
-    """How fast the smoothed signal changes, dB per second; ``None``: not known."""
 
     def __post_init__(self) -> None:
         if self.peer is not None:
             check_name("link.peer", self.peer)
         check_range("link.rssi_dbm", self.rssi_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
-        check_range("link.trend_db_s", self.trend_db_s, -MAX_TREND_DB_S, MAX_TREND_DB_S)
         check_range("link.bitrate_mbps", self.bitrate_mbps, 0.0, MAX_BITRATE_MBPS)
         check_range("link.retry_ratio", self.retry_ratio, 0.0, 1.0)
 

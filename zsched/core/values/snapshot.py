@@ -164,8 +164,6 @@ class TaskStatus(Struct, frozen=True, kw_only=True):
     streams: tuple[StreamCount, ...] = ()
     history: tuple[PastAllocation, ...] = ()
     problems: tuple[str, ...] = ()
-    patience: float = 0.0
-    """Utility seconds that staying may cost."""
     round_trips: tuple[tuple[NodeId, float], ...] = ()
     """(node, seconds from the answering node to it and back), of a task with a deadline."""
     pause: HoldStatus | None = None

@@ -9,19 +9,10 @@ import types
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from enum import Enum
-from functools import partial
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
-from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.values.fleet import (
-    DEFAULT_BONUS,
-    DEFAULT_COOL_DOWN_S,
-    DEFAULT_SCORE,
-    PAPER_PATIENCE,
-    TaskSpec,
-)
+from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_SCORE, TaskSpec
 from zsched.core.values.model import ScoreForm, Tuning, Weights
-from zsched_lab.decisions import ledger
 from zsched_lab.decisions.entries import CPU_ONLY, MEMORY_ONLY, PAPER_COST, RAW
 from zsched_lab.decisions.rules import CoreRule, PickRule, Rule
 from zsched_lab.decisions.service.replay import Deadline, Player, is_of_task
@@ -29,11 +20,9 @@ from zsched_lab.decisions.view import Look, Sight
 from zsched_lab.decisions.world import EVEN, RADIO_ONLY
 from zsched_lab.paper.schemes import PAPER_BONUS
 
-LEDGER: Final = ("price_s", "memory_s", "ahead_s")
-OWN: Final = (*LEDGER, "smoothing_s", "is_told", "tells_jobs", "time_to_trigger_s")
+OWN: Final = ("smoothing_s", "is_told", "tells_jobs")
 """Settings of a rule that are neither of `Tuning` nor of `TaskSpec`; ``is_told=0``: run queues are not read;
-``tells_jobs=0``: the worker says nothing of its jobs; ``time_to_trigger_s``: in place of patience, as it once was;
-those of `LEDGER`: by a ledger (`zsched_lab.decisions.ledger`), which has none of patience, cool-down and cap."""
+``tells_jobs=0``: the worker says nothing of its jobs."""
 
 
 def players() -> tuple[Player, ...]:
@@ -41,7 +30,6 @@ def players() -> tuple[Player, ...]:
     return (
         zsched("service"),
         zsched("paper", score=ScoreForm.PAPER),
-        zsched("ledger", price_s=ledger.PRICE_S, bonus=ledger.BONUS),
         _picks("dyna_cpu", CPU_ONLY, PAPER_COST),
         _picks("dyna_mem", MEMORY_ONLY, PAPER_COST),
         _picks("dyna_both", EVEN, PAPER_COST),
@@ -62,21 +50,10 @@ def zsched(name: str, **settings: Any) -> Player:
     is_told, tells_jobs = bool(given.pop("is_told", True)), bool(given.pop("tells_jobs", True))
     deadline = given.pop("deadline", None)
     changes = {key: given.pop(key) for key in tuple(given) if is_of_task(key)}
-    is_service = given.setdefault("score", DEFAULT_SCORE) is ScoreForm.SERVICE  # no task here weighs the network
-    trigger_s = given.pop("time_to_trigger_s", None)
-    by = {name: given.pop(name) for name in LEDGER if name in given}
-    made = partial(ledger.Ledger, **by) if by else None
-    if made is not None:
-        given = {"cool_down_s": 0.0, "max_moves_per_minute": None, **given}
-    if trigger_s is None:
-        if "patience" not in changes:
-            changes.setdefault("learns_patience", is_service)
-            changes["patience"] = FIRST_PATIENCE if is_service else PAPER_PATIENCE
-        given = {"bonus": DEFAULT_BONUS, "cool_down_s": DEFAULT_COOL_DOWN_S, **given}
-    tuning = Tuning(**{"weights": EVEN, **given})
+    tuning = Tuning(**{"weights": EVEN, "score": DEFAULT_SCORE, "bonus": DEFAULT_BONUS, **given})
     return Player(
         name=name,
-        make=_core(tuning, changes, trigger_s, made),
+        make=_core(tuning, changes),
         tuning=tuning,
         look=Look(smoothing_s=smoothing_s),
         changes=changes,
@@ -86,14 +63,9 @@ def zsched(name: str, **settings: Any) -> Player:
     )
 
 
-def _core(
-    tuning: Tuning,
-    changes: Mapping[str, Any],
-    trigger_s: float | None,
-    made: Callable[[], ledger.Ledger] | None,
-) -> Callable[[Sight], Rule]:
-    own = {name: changes[name] for name in ("patience", "learns_patience") if name in changes}
-    return lambda view: CoreRule(view, tuning, time_to_trigger_s=trigger_s, ledger=made, **own)
+def _core(tuning: Tuning, changes: Mapping[str, Any]) -> Callable[[Sight], Rule]:
+    own = {name: changes[name] for name in ("price_s", "memory_s") if name in changes}
+    return lambda view: CoreRule(view, tuning, **own)
 
 
 def _picks(name: str, weights: Weights, cost: float) -> Player:
@@ -105,7 +77,7 @@ def _picks(name: str, weights: Weights, cost: float) -> Player:
 def described(text: str) -> Player:
     """A rule by its description, ``NAME:key=value,key=value``. Raises `ValueError` when there is no such setting.
 
-    >>> described("hasty:smoothing_s=0.5,patience=0.3,weights=0.7/0.3/0").tuning.weights
+    >>> described("hasty:smoothing_s=0.5,price_s=0.2,weights=0.7/0.3/0").tuning.weights
     Weights(cpu=0.7, memory=0.3, network=0.0)
     """
     name, _, rest = text.partition(":")

@@ -66,7 +66,7 @@ def past_of(seconds: int = 40, status: dict[str, Any] | None = None) -> Past:
         if number == seconds - 20:
             reason = "edge2 leads by 0.2 over edge1 with its bonus; staying has cost 0.21"
             entries = (
-                move(250.0, "echo", 1, None, "edge1", "first placement: edge1 has the highest utility"),
+                move(250.0, "echo", 1, None, "edge1", "first placement: edge1 is worth most"),
                 move(20.0, "echo", 2, "edge1", "edge2", reason),
                 {"at": NOON - 19.9, "life": 7, "task": "echo", "epoch": 2, "took_s": 0.043},
             )

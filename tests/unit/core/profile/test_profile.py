@@ -158,7 +158,7 @@ def test_a_fixed_signal_is_the_figure_of_the_file_whatever_it_is(dbm: float) -> 
     for step, signal in enumerate((-60.0, dbm)):
         profiler.absorb(device(), (LinkSample(source=LinkSource.FIXED, rssi_dbm=signal),), 100.0 + step)
         (link,) = taken(profiler, 100.0 + step).links
-        assert (link.rssi_dbm, link.trend_db_s) == (signal, 0.0)
+        assert link.rssi_dbm == signal
     profiler.absorb(device(), (LinkSample(source=LinkSource.FIXED),), 102.0)
     assert taken(profiler, 102.0).links == (Link(source=LinkSource.FIXED),)
 
@@ -424,40 +424,6 @@ def test_what_cannot_be_read_is_soon_not_measured_though_samples_come() -> None:
     assert told(11.0) == [3.0, 3000.0, 0.7, 300.0]
 
 
-# --- the trend of a signal -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("slope", [-1.0, 0.0, 1.0])
-def test_on_a_ramp_the_trend_is_its_slope_and_foreseeing_a_time_constant_undoes_the_delay(slope: float) -> None:
-    """Brown 1956: a mean lags a ramp by tau, the mean of the means by 2 tau."""
-    signal, tau_s, mean = SignalFilter(3.0), 3.0, 0.0
-    for step in range(400):
-        mean = signal.update(-60.0 + slope * 0.05 * step, 0.05 * step) or 0.0
-    assert signal.trend_db_s == pytest.approx(slope, abs=0.05)
-    true = -60.0 + slope * 0.05 * 399
-    assert mean + tau_s * (signal.trend_db_s or 0.0) == pytest.approx(true, abs=0.2)
-
-
-def test_without_a_signal_there_is_no_trend() -> None:
-    signal, trends = SignalFilter(3.0), []
-    for rssi, at in ((None, 0.0), (-60.0, 0.2), (None, STALE_S + 1.0)):
-        signal.update(rssi, at)
-        trends.append(signal.trend_db_s)
-    assert trends == [None, 0.0, None]
-
-
-def test_a_profile_carries_the_trend_of_a_radio_and_none_of_a_cable() -> None:
-    profiler = make_profiler()
-    for step in range(30):
-        profiler.absorb(
-            device(), (radio(-50.0 - 0.4 * step), LinkSample(source=LinkSource.WIRED, peer="x")), 0.2 * step
-        )
-    links = taken(profiler, 6.0).links
-    assert links[0].trend_db_s is not None
-    assert -2.0 < links[0].trend_db_s < -1.0
-    assert links[1].trend_db_s is None
-
-
 def test_the_threads_of_a_worker_are_smoothed_in_step_with_those_of_its_machine() -> None:
     """So the rest, all others, stays what it is while the worker starts, works and ends."""
     profiler, compared = make_profiler(), 0
@@ -604,22 +570,6 @@ def test_of_somebody_else_s_worker_its_jobs_are_told_and_their_use() -> None:
     assert worker.cpu_cores == pytest.approx(0.2, rel=0.01)
     assert (worker.memory_mb, worker.runnable) == (None, None)
     assert taken(profiler, 100.0).workers == (WorkerLoad(task="merge", state=WorkerState.READY),), "nobody measures"
-
-
-@pytest.mark.parametrize("tau_s", [0.5, 4.0])
-def test_a_signal_goes_on_by_another_time_constant_and_its_trend_begins_anew(tau_s: float) -> None:
-    signal = SignalFilter(1.0)
-    for step in range(400):
-        signal.update(-30.0 - 0.05 * step, now=0.05 * step)
-    before = signal.update(None, now=20.0)
-    assert signal.trend_db_s == pytest.approx(-1.0, abs=0.05)
-    signal.retune(1.0)
-    assert signal.trend_db_s == pytest.approx(-1.0, abs=0.05), "nothing has changed"
-    signal.retune(tau_s)
-    assert (signal.update(None, now=20.0), signal.trend_db_s) == (before, 0.0)
-    for step in range(400, 400 + round(200 * tau_s)):
-        signal.update(-50.0 + 0.02 * (step - 400), now=0.05 * step)
-    assert signal.trend_db_s == pytest.approx(0.4, abs=0.06)
 
 
 def test_the_signal_of_a_link_goes_on_by_another_time_constant() -> None:

@@ -13,7 +13,7 @@ from zsched.core.scheduler.damping import EARLY_FAILURE_S, MAX_PENALTY, STEP, WI
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.standing import Standing
 
-SPEC = task_of(tuning=tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0), patience=0.0, max_moves_per_minute=2)
+SPEC = task_of(tuning=tuning_of(cpu=1.0, memory=0.0), price_s=0.0, max_moves_per_minute=2)
 OWNED = allocation_of(tuning=SPEC.tuning)
 
 
@@ -89,10 +89,10 @@ def test_a_node_that_failed_is_not_chosen_again_at_once() -> None:
     damping, judge = Damping(), Judge(spec=SPEC)
     damping.note_move("edge2", has_failed=True, now=100.0)
     joint = standing(edge1=0.5, edge2=0.65)
-    now = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=101.0, damping=damping)
+    now = judge.judge(joint, OWNED, escape=None, is_called=False, now=101.0, damping=damping)
     assert now.outcome is Outcome.STAY
-    judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=900.0, damping=damping)
-    later = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=901.0, damping=damping)
+    judge.judge(joint, OWNED, escape=None, is_called=False, now=900.0, damping=damping)
+    later = judge.judge(joint, OWNED, escape=None, is_called=False, now=901.0, damping=damping)
     assert (later.outcome, later.candidate) == (Outcome.PROPOSE, "edge2")
 
 
@@ -101,7 +101,7 @@ def test_a_penalised_node_serves_when_it_is_the_only_one() -> None:
     for number in range(5):
         damping.note_move("edge2", has_failed=True, now=100.0 + number)
     judgement = Judge(spec=SPEC).judge(
-        standing(edge2=0.1), OWNED, settled_for_s=0, escape="edge1 is gone", is_called=False, now=106.0, damping=damping
+        standing(edge2=0.1), OWNED, escape="edge1 is gone", is_called=False, now=106.0, damping=damping
     )
     assert (judgement.outcome, judgement.candidate) == (Outcome.PROPOSE, "edge2")
 
@@ -111,14 +111,12 @@ def test_planned_moves_are_capped_per_minute_and_escapes_are_not_by_that_cap() -
     for at in (100.0, 110.0):
         damping.note_move("edge3", has_failed=False, now=at)
     joint = standing(edge1=0.2, edge2=0.9)
-    capped = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=True, now=120.0, damping=damping)
+    capped = judge.judge(joint, OWNED, escape=None, is_called=True, now=120.0, damping=damping)
     assert capped.outcome is Outcome.WAIT
     assert "2 moves in the last minute, at most 2" in capped.reason
-    fled = judge.judge(
-        joint, OWNED, settled_for_s=99, escape="edge1 is gone", is_called=False, now=120.0, damping=damping
-    )
+    fled = judge.judge(joint, OWNED, escape="edge1 is gone", is_called=False, now=120.0, damping=damping)
     assert fled.outcome is Outcome.PROPOSE
-    free = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=False, now=175.0, damping=damping)
+    free = judge.judge(joint, OWNED, escape=None, is_called=False, now=175.0, damping=damping)
     assert free.outcome is Outcome.PROPOSE
 
 
@@ -127,13 +125,13 @@ def test_the_cap_is_no_matter_where_nobody_wants_to_move() -> None:
     for at in (100.0, 110.0):
         damping.note_move("edge3", has_failed=False, now=at)
     joint = standing(edge1=0.9, edge2=0.2)
-    stays = judge.judge(joint, OWNED, settled_for_s=99, escape=None, is_called=True, now=120.0, damping=damping)
+    stays = judge.judge(joint, OWNED, escape=None, is_called=True, now=120.0, damping=damping)
     assert (stays.outcome, "last minute" in stays.reason) == (Outcome.STAY, False)
 
 
 def test_what_any_robot_remembers_counts_and_nothing_counts_for_a_judge_without_damping() -> None:
     joint = replace(standing(edge1=0.5, edge2=0.6), penalties={"edge2": 0.3})
-    given: dict[str, Any] = {"settled_for_s": 99.0, "escape": None, "is_called": False, "now": 100.0}
+    given: dict[str, Any] = {"escape": None, "is_called": False, "now": 100.0}
     forgetful = Judge(spec=SPEC).judge(joint, OWNED, **given, damping=Damping())
     assert forgetful.aggregates["edge2"] == pytest.approx(0.3)
     own = Damping()

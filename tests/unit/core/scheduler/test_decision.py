@@ -29,14 +29,13 @@ from zsched_lab.sim.simulator import Simulator
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
 
 
-def fleet(learns: bool = True, tasks: int = 1) -> Fleet:
+def fleet(tasks: int = 1) -> Fleet:
     specs = [
         task_of(
             f"task{number}",
             EDGES,
-            tuning=tuning_of(cpu=0.6, memory=0.4, cool_down_s=1.0),
-            patience=0.1,
-            learns_patience=learns,
+            tuning=tuning_of(cpu=0.6, memory=0.4),
+            price_s=3.0,
             worker=WorkerSpec(command=("worker",)),
         )
         for number in range(tasks)
@@ -53,7 +52,7 @@ def restless(seed: int) -> Simulator:
         period = phases.get(node)
         return (3.9 if period and now % (2 * period) < period else 1.0), 1000.0
 
-    return Simulator(fleet=fleet(learns=bool(seed % 2), tasks=1 + seed % 2), seed=seed, load=load)
+    return Simulator(fleet=fleet(tasks=1 + seed % 2), seed=seed, load=load)
 
 
 def judged(sim: Simulator, seconds: float) -> Iterator[Decision]:
@@ -114,7 +113,7 @@ def test_only_a_judgement_that_changed_is_written_down() -> None:
     assert sim.stories == []
 
 
-def test_since_when_an_owner_cannot_be_scored_or_is_not_ready_is_remembered() -> None:
+def test_what_is_owed_and_since_when_an_owner_is_not_ready_is_remembered() -> None:
     sim = Simulator(fleet=fleet(), seed=5)
     sim.start(*ROBOTS, *EDGES)
     sim.run(10.0)
@@ -124,7 +123,7 @@ def test_since_when_an_owner_cannot_be_scored_or_is_not_ready_is_remembered() ->
     owner, profile = figures.allocation.owner, figures.owner_profile
     assert owner is not None
     assert profile is not None
-    memory = replace(figures.judge, unscored_since=figures.now - 1.5, not_ready_since=figures.now - 4.0)
+    memory = replace(figures.judge, owed=((owner, 0.05),), charged_at=figures.now, not_ready_since=figures.now - 4.0)
     unscored = tuple(
         replace(
             vector,
@@ -134,7 +133,7 @@ def test_since_when_an_owner_cannot_be_scored_or_is_not_ready_is_remembered() ->
         for vector in figures.vectors
     )
     waits = decide_again(replace(figures, judge=memory, vectors=unscored)).judgement
-    assert "for 1.5 of 2 s" in waits.reason
+    assert f"{owner} cannot be scored, and owes 0.05 s more" in waits.reason
     starting = replace(profile, workers=tuple(replace(one, state=WorkerState.STARTING) for one in profile.workers))
     waits = decide_again(replace(figures, judge=memory, owner_profile=starting)).judgement
     assert f"{owner} will be left in 16 s" in waits.reason
@@ -176,7 +175,7 @@ def test_an_owner_short_of_memory_is_left_for_a_machine_that_is_not() -> None:
 def test_where_all_are_short_of_memory_nobody_is_fled_from() -> None:
     decided = decide_again(full(has_room=False))
     assert (decided.escape, decided.judgement.is_escape) == (None, False)
-    assert decided.judgement.reason.startswith("edge2 leads by 0.5"), "cool-down and patience hold it as ever"
+    assert decided.judgement.reason.startswith("edge1 owes "), "it moves as ever"
 
 
 def test_nothing_better_is_on_a_machine_that_would_be_left_for_its_memory_at_once() -> None:
@@ -210,7 +209,7 @@ def test_a_flight_from_short_memory_takes_its_turn_and_no_other_one_does(*, is_g
 
 def test_of_two_tasks_that_are_short_of_memory_on_one_machine_one_leaves() -> None:
     """Both fled in one round to the same machine, and both fled back: 68 moves in a minute."""
-    tuning = tuning_of(cpu=0.5, memory=0.5, score=ScoreForm.PAPER, cool_down_s=2.0)
+    tuning = tuning_of(cpu=0.5, memory=0.5, score=ScoreForm.PAPER)
     demand = Demand(cpu_cores=0.1, memory_mb=1500.0)
     first = replace(FLEET.tasks[0], exclusive=False, demand=demand, tuning=tuning)
     tasks = tuple(replace(first, name=name) for name in ("merge", "plan"))
@@ -232,7 +231,7 @@ def test_of_two_tasks_that_are_short_of_memory_on_one_machine_one_leaves() -> No
 
 def test_a_task_does_not_go_round_between_machines_that_are_all_short_of_memory() -> None:
     """Each flight took half a second, and nothing held the next one."""
-    tuning = tuning_of(score=ScoreForm.PAPER, cool_down_s=2.0)
+    tuning = tuning_of(score=ScoreForm.PAPER)
     spec = task_of(candidates=EDGES[:2], tuning=tuning, worker=WorkerSpec(command=("worker",)))
     used_mb = [1000.0]
     sim = Simulator(fleet=fleet_of(spec), seed=1, load=lambda _node, _now: (1.0, used_mb[0]))

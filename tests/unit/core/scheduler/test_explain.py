@@ -24,6 +24,7 @@ from zsched.core.scheduler.explain import (
     utility_of,
     without,
 )
+from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.standing import pick
 from zsched.core.values.decision import DampingMemory, Decision, JudgeMemory, Need
 from zsched.core.values.model import (
@@ -39,7 +40,7 @@ from zsched.core.values.model import (
 )
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2", "edge3")
-TUNING = replace(tuning_of(cpu=0.5, memory=0.3, network=0.2, bonus=0.05, cool_down_s=2.0), score=ScoreForm.SERVICE)
+TUNING = replace(tuning_of(cpu=0.5, memory=0.3, network=0.2, bonus=0.05), score=ScoreForm.SERVICE)
 TERMS = {"edge1": (0.9, 0.8, 0.7), "edge2": (0.95, 0.9, 0.5), "edge3": (0.4, 0.9, 0.9)}
 
 
@@ -68,7 +69,7 @@ def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **chang
         "vectors": tuple(vectors),
         "damping": DampingMemory(points=(("edge3", 1.0, 990.0),)),
     }
-    figures = figures_of(task_of(candidates=EDGES, patience=0.15), *ROBOTS, **{**given, **changes})
+    figures = figures_of(task_of(candidates=EDGES, price_s=0.15), *ROBOTS, **{**given, **changes})
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
 
@@ -163,7 +164,7 @@ def test_the_worth_that_is_named_is_enough_whatever_the_owner_s_is(seed: int) ->
     told = explained(decision_worth(worth))
     needed = float(told.changes[0].split("worth ")[1].split(" ")[0])
     again = explained(decision_worth({**worth, "edge2": needed}))
-    assert again.changes[0].startswith("edge2 leads by")
+    assert again.changes[0].startswith("edge1 owes")
 
 
 @pytest.mark.parametrize("joint", [0.1, 0.34, 0.36, 0.6])
@@ -173,7 +174,7 @@ def test_the_worth_that_is_named_makes_up_for_a_penalty_also_above_the_joint_wor
     told = explained(decision_worth(worth, penalty=0.35))
     lack = 0.7509 - joint
     assert told.changes[0] == f"edge2 would have to be worth 0.7509 instead of {joint:.4f} ({lack:+.4f})"
-    for needed, begins in ((0.7509, "edge2 leads by"), (0.7508, "edge2 would have to be worth")):
+    for needed, begins in ((0.7509, "edge1 owes"), (0.7508, "edge2 would have to be worth")):
         again = explained(decision_worth({**worth, "edge2": needed}, penalty=0.35))
         assert again.changes[0].startswith(begins)
 
@@ -234,14 +235,22 @@ def test_the_level_of_the_owner_s_cpu_that_is_named_is_the_one_at_which_another_
         assert pick(dict(again.verdict.aggregates), "edge1") == winner
 
 
-def test_a_leader_that_waits_is_told_how_long_by_its_lead() -> None:
-    decision = decision_of(owner="edge3", settled_for_s=0.5)
-    told = explained(decision)
+def test_a_leader_that_waits_is_told_what_its_lead_has_cost() -> None:
+    figures = replace(decision_of(owner="edge3").figures, judge=JudgeMemory(owed=(("edge3", 0.25),), charged_at=1000.0))
+    dear = judged_again(decision_of(owner="edge3"), replace(figures, rules=replace(figures.rules, price_s=3.0)))
+    told = explained(dear)
     assert told.outcome == "wait"
-    lead = (told.candidates[0].total or 0.0) - next(one.total or 0.0 for one in told.candidates if one.is_owner)
-    assert told.changes[0] == f"{told.candidates[0].node} leads by {lead:.4f} and must go on leading:"
-    assert told.changes[1] == "until the cool-down ends, in 1.5 s"
-    assert told.changes[2].endswith(f"in {0.15 / lead:.1f} s by this lead")
+    first, own = told.candidates[0], next(one for one in told.candidates if one.is_owner)
+    assert first.owed_s is not None
+    assert own.owed_s is not None
+    more_s = own.owed_s - first.owed_s
+    assert own.total is not None
+    assert first.total is not None
+    assert more_s == pytest.approx(0.25 + AHEAD_S * (first.total - own.total))
+    assert told.changes[:2] == (
+        f"edge3 owes {more_s:.2f} s more than {first.node}, and must go on losing:",
+        "until that is the price of a move, 3 s",
+    )
 
 
 @pytest.mark.parametrize(
@@ -257,19 +266,11 @@ def test_a_leader_that_waits_is_told_how_long_by_its_lead() -> None:
     ids=["another task", "silent electors", "many moves"],
 )
 def test_a_leader_is_told_what_else_it_waits_for(held_by: dict[str, Any], told_of: str) -> None:
-    decision = decision_of(owner="edge3", settled_for_s=60.0, **held_by)
+    decision = decision_of(owner="edge3", **held_by)
     changes = explained(decision).changes
     assert told_of.format(most=decision.figures.rules.max_moves_per_minute) in changes
-    assert not any(text.startswith("until the cool-down") for text in changes)
-    free = explained(decision_of(owner="edge3", settled_for_s=60.0)).changes
-    assert not any(text.startswith("until") and "staying has cost" not in text for text in free)
-
-
-def test_a_leader_whose_patience_is_spent_waits_for_the_cool_down_alone() -> None:
-    decision = decision_of(owner="edge3", settled_for_s=0.5, judge=JudgeMemory(spent=0.15))
-    leads, *waits = explained(decision).changes
-    assert leads.endswith("and must go on leading:")
-    assert waits == ["until the cool-down ends, in 1.5 s"]
+    free = explained(decision_of(owner="edge3")).changes
+    assert not any(text.startswith("until") for text in free)
 
 
 def test_who_refuses_a_candidate_is_told_with_why() -> None:

@@ -22,7 +22,7 @@ from zsched.core.values.model import Asked, NodeId, PeerState, Pin
 
 ROBOTS = ("robot1", "robot2", "robot3")
 NODES = ("edge1", "edge2", "edge3")
-SPEC = task_of(candidates=NODES, patience=0.1)
+SPEC = task_of(candidates=NODES, price_s=0.1)
 
 
 def drain(node: NodeId = "edge1", for_s: float | None = None, revision: int = 3) -> Flag:

@@ -17,6 +17,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.claims import taken
 from zsched.core.scheduler.judge import Outcome
+from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.messages import Utilities
@@ -27,10 +28,10 @@ from zsched.core.vote.voting import Voting, vote_time
 
 T = TypeVar("T")
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
-TUNING = tuning_of(cpu=1.0, memory=0.0, cool_down_s=0.0)
-PATIENCE = 1.0
+TUNING = tuning_of(cpu=1.0, memory=0.0)
+PRICE_S = 3.0
 FLEET = fleet_of(
-    task_of(candidates=EDGES, tuning=TUNING, patience=PATIENCE, worker=WorkerSpec(command=("merge",))),
+    task_of(candidates=EDGES, tuning=TUNING, price_s=PRICE_S, worker=WorkerSpec(command=("merge",))),
     of=sorted((*ROBOTS, *EDGES)),
     electors=ROBOTS,
 )
@@ -269,11 +270,11 @@ def lead_of(robot: Robot) -> float:
     return max(aggregates.values()) - aggregates["edge1"]
 
 
-def test_a_lead_is_followed_in_the_round_by_which_staying_has_cost_the_patience() -> None:
+def test_a_lead_is_followed_in_the_round_by_which_staying_has_cost_a_move() -> None:
     robot = Robot(owner_cpu=3.9)
     robot.round(edge1=0.02)
     assert robot.outcome() is Outcome.WAIT
-    due = robot.now + PATIENCE / lead_of(robot)
+    due = robot.now + PRICE_S / lead_of(robot) - AHEAD_S
     while robot.outcome() is Outcome.WAIT:
         robot.profiles({"edge1": 3.9})
         out = robot.round(edge1=0.02)
@@ -281,35 +282,18 @@ def test_a_lead_is_followed_in_the_round_by_which_staying_has_cost_the_patience(
     assert proposed(out) == ["edge2"]
 
 
-def test_an_operator_s_patience_and_cap_count_from_the_next_round_and_the_file_s_when_they_end() -> None:
+def test_an_operator_s_price_counts_from_the_next_round_and_the_file_s_when_it_ends() -> None:
     robot = Robot(owner_cpu=3.9)
     robot.round(edge1=0.02)
     assert robot.outcome() is Outcome.WAIT
-    robot.value = replace(robot.value, revision=6, tuning=replace(TUNING, patience=0.0, max_moves_per_minute=1))
+    robot.value = replace(robot.value, revision=6, tuning=replace(TUNING, price_s=0.0))
     robot.profiles({"edge1": 3.9})
     assert proposed(robot.round(edge1=0.02)) == ["edge2"]
     figures = robot.task.figures
     assert figures is not None
-    assert (figures.rules.patience, figures.rules.max_moves_per_minute) == (0.0, 1)
+    assert figures.rules.price_s == 0.0
     robot.task.under(TUNING)
-    assert (robot.task.spec, robot.task.judge.patience) == (FLEET.tasks[0], PATIENCE)
-
-
-@pytest.mark.parametrize(("paused", "pinned"), [(True, False), (False, True)])
-def test_what_staying_costs_while_an_operator_holds_a_task_moves_nothing_afterwards(
-    *, paused: bool, pinned: bool
-) -> None:
-    robot = Robot(owner_cpu=3.9)
-    robot.value = replace(robot.value, paused=paused, pinned=pinned)
-    for _ in range(10):
-        robot.profiles({"edge1": 3.9})
-        robot.round(edge1=0.02)
-    assert robot.outcome() is Outcome.STAY
-    robot.value = replace(robot.value, paused=False, pinned=False)
-    robot.decider.on_learnt("merge", is_new_epoch=False, now=robot.now)
-    robot.profiles({"edge1": 3.9})
-    assert proposed(robot.round(edge1=0.02)) == []
-    assert robot.outcome() is Outcome.WAIT
+    assert robot.task.spec == FLEET.tasks[0]
 
 
 def test_a_call_to_a_vote_ends_with_the_value_that_it_was_for() -> None:
@@ -471,7 +455,7 @@ def test_winners_voters_commit_staggered_by_rank_and_once(me: str, other: str, r
         assert robot.decider.next_deadline() <= robot.now + wait
     ((name, change),) = robot.votes.due_commits(robot.now + wait)
     assert (name, change.owner, change.base_revision) == ("merge", "edge2", 5)
-    assert "edge2 leads" in change.reason, "its own reason goes into the history"
+    assert "edge1 owes" in change.reason, "its own reason goes into the history"
     assert robot.votes.due_commits(robot.now + 9.0) == [], "handed out once"
 
 
@@ -688,7 +672,7 @@ def test_a_task_that_flees_from_nobody_leaves_no_room_to_others() -> None:
     robot.gathered()
     figures = robot.rounds.tasks["plan"].figures
     assert figures is not None
-    assert (figures.first, figures.claimed) == ("merge", ()), "its turn comes, and its patience goes on"
+    assert (figures.first, figures.claimed) == ("merge", ()), "its turn comes"
 
 
 def test_a_proposal_that_no_vote_counts_any_more_and_one_to_stay_are_no_claims() -> None:
@@ -807,16 +791,16 @@ def test_a_time_in_which_the_owner_was_not_heard_is_no_time_in_which_its_worker_
 
 
 def beaten() -> Robot:
-    """A robot at which the owner has been beaten for a round, and has not used up the patience."""
+    """A robot at which the owner has been beaten for a round, and has not lost what a move costs."""
     robot = Robot(owner_cpu=3.9)
     for _ in range(2):
         robot.profiles({"edge1": 3.9})
         robot.round(edge1=0.02)
-    assert 0.0 < robot.task.judge.spent < PATIENCE
+    assert 0.0 < robot.task.judge.ledger.owed["edge1"] < PRICE_S
     return robot
 
 
-def test_a_vote_that_stays_gives_the_caller_all_its_patience_again() -> None:
+def test_a_vote_that_stays_forgives_what_the_caller_saw_owed() -> None:
     """Else a robot with a nervous view would call a vote in every round."""
     robot = beaten()
     for voter in ("robot2", "robot3"):
@@ -824,8 +808,8 @@ def test_a_vote_that_stays_gives_the_caller_all_its_patience_again() -> None:
     robot.paper("robot1", "edge2")
     assert robot.voting.tally is not None
     assert robot.voting.tally.outcome is VoteOutcome.STAY
-    assert robot.task.judge.spent == 0.0
-    robot.now += 0.7 * PATIENCE / lead_of(robot)
+    assert not robot.task.judge.ledger.owed
+    robot.now += 0.7 * (PRICE_S / lead_of(robot) - AHEAD_S)
     robot.profiles({"edge1": 3.9})
     assert proposed(robot.round(edge1=0.02)) == []
     assert robot.outcome() is Outcome.WAIT
@@ -837,15 +821,16 @@ def test_a_vote_without_a_quorum_does_not() -> None:
     robot.tick(vote_time(FLEET.timing))
     assert robot.voting.tally is not None
     assert robot.voting.tally.outcome is VoteOutcome.NO_QUORUM
-    assert robot.task.judge.spent > 0.0
+    assert robot.task.judge.ledger.owed["edge1"] > 0.0
 
 
 @pytest.mark.parametrize("is_new_epoch", [True, False])
 def test_a_new_owner_has_all_its_time_to_get_ready_and_new_weights_give_none(is_new_epoch: bool) -> None:
     robot = beaten()
     robot.task.judge.absences.since = 90.0
+    owed = dict(robot.task.judge.ledger.owed)
     robot.decider.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
-    assert robot.task.judge.spent == 0.0
+    assert robot.task.judge.ledger.owed == owed, "or it would go back and forth"
     assert robot.task.judge.absences.since == (None if is_new_epoch else 90.0)
 
 

@@ -632,32 +632,6 @@ def test_a_path_with_a_dead_end_is_dead_by_every_reading(pair: PairReading, dead
     assert not pair_of(ways["mine"], ways["theirs"], LinkLimits(pair=pair)).reachable
 
 
-def fading(rssi: float, trend: float | None) -> tuple[Link, ...]:
-    return (Link(source=LinkSource.NL80211, rssi_dbm=rssi, trend_db_s=trend),)
-
-
-@pytest.mark.parametrize(
-    ("rssi", "trend", "network"),
-    [
-        (-60.0, None, 0.5),
-        (-60.0, 0.0, 0.5),
-        (-60.0, -1.0, 0.45),
-        (-60.0, 1.0, 0.55),
-        (-60.0, -9.0, 0.35),
-        (-78.0, -9.0, 0),
-    ],
-)
-def test_a_foreseen_signal_follows_its_trend_for_at_most_6_db(rssi: float, trend: float | None, network: float) -> None:
-    found = pair_of(WIRED, fading(rssi, trend), LinkLimits(foresee_s=2.0))
-
-    assert found.network == pytest.approx(network)
-    assert found.reachable, "only what is measured takes a candidate out of reach"
-
-
-def test_without_the_option_a_trend_changes_nothing() -> None:
-    assert pair_of(WIRED, fading(-60.0, -5.0), LinkLimits()).network == 0.5
-
-
 def test_of_three_robots_the_best_and_the_second_best_tie_by_the_weaker_way_only() -> None:
     """Why `weaker` is not the default: it cannot tell the two best of three robots apart (docs/decisions/0018)."""
     signals = {"robot1": -45.0, "robot2": -65.0, "robot3": -75.0}
@@ -837,7 +811,7 @@ def gpu_worlds(draw: st.DrawFn) -> tuple[dict[str, tuple[float, float]], float]:
 def test_a_task_whose_use_of_the_gpu_nobody_knows_does_not_chase_itself(
     world: tuple[dict[str, tuple[float, float]], float], weights: dict[str, float], form: ScoreForm
 ) -> None:
-    """Where nothing changes but what it uses itself, it comes to rest, without bonus, patience and cool-down."""
+    """Where nothing changes but what it uses itself, it comes to rest, without bonus and price."""
     machines, used = world
     spec, owner, left = replace(SPEC, demand=Demand(cpu_cores=0.4)), "edge1", set[str]()
     while owner not in left:

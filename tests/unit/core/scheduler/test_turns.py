@@ -233,8 +233,8 @@ def test_a_single_task_has_no_bookings() -> None:
 
 # --- GPUs ------------------------------------------------------------------------------------------------------------
 
-ON_GPU = Tuning(weights=Weights.of({"cpu": 0.5, "gpu": 0.5}), score=ScoreForm.SERVICE, bonus=0.05, cool_down_s=2.0)
-TWO = tuple(task_of(name, demand=Demand(gpu=0.4), tuning=ON_GPU, patience=0.3) for name in ("a", "b"))
+ON_GPU = Tuning(weights=Weights.of({"cpu": 0.5, "gpu": 0.5}), score=ScoreForm.SERVICE, bonus=0.05)
+TWO = tuple(task_of(name, demand=Demand(gpu=0.4), tuning=ON_GPU, price_s=0.3) for name in ("a", "b"))
 
 
 def test_two_tasks_that_leave_one_gpu_at_the_same_moment_do_not_go_together() -> None:

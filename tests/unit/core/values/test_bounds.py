@@ -197,9 +197,8 @@ NAMES = [
 RATIO = (0.0, 1.0)
 RANGES = [
     (TUNING, "bonus", "bonus", RATIO),
-    (TUNING, "cool_down_s", "cool_down_s", (0.0, 86400.0)),
+    (tuning_of(), "price_s", "price_s", (0.0, 1000.0)),
     (LINK, "rssi_dbm", "link.rssi_dbm", (-120.0, 0.0)),
-    (LINK, "trend_db_s", "link.trend_db_s", (-100.0, 100.0)),
     (LINK, "bitrate_mbps", "link.bitrate_mbps", (0.0, MAX_BITRATE_MBPS)),
     (LINK, "retry_ratio", "link.retry_ratio", RATIO),
     (LOAD, "cpu_cores", "worker.cpu_cores", (0.0, MAX_CPU_CORES)),

@@ -7,8 +7,6 @@ import pytest
 
 from support.fleets import tuning_of
 from zsched.core.values.fleet import (
-    PAPER_PATIENCE,
-    RADIO_PATIENCE,
     TUNED_LINKS,
     TUNED_RULES,
     Demand,
@@ -20,11 +18,10 @@ from zsched.core.values.fleet import (
     TaskSpec,
     Timing,
     WorkerSpec,
-    default_patience,
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, NodeKind, PairReading, Reach, ScoreForm, Tuning, Weights
+from zsched.core.values.model import Aggregate, NodeKind, PairReading, Reach, Weights
 from zsched.core.values.plan import Direction
 from zsched.core.values.profile import LinkSource
 
@@ -51,7 +48,7 @@ FLEET = Fleet(
 
 
 def test_defaults_are_the_design_s_first_ones() -> None:
-    assert (TUNING.bonus, TUNING.cool_down_s, TASK.patience) == (0.10, 10.0, 0.55)
+    assert (TUNING.bonus, TASK.price_s, TASK.memory_s) == (0.10, 0.3, 200.0)
     assert TUNING.aggregate is Aggregate.MEAN
     assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
     timing = Timing()
@@ -135,15 +132,13 @@ def test_electorate_hash_depends_on_fleet_and_electors_only() -> None:
 # --- tuned by operators ----------------------------------------------------------------------------------------------
 
 OWN: dict[str, Any] = {
-    "patience": 0.7,
-    "max_moves_per_minute": 2,
+    "price_s": 0.7,
     "memory_floor_ratio": 0.3,
     "cpu_floor_ratio": 0.2,
     "reach": Reach.ALL,
     "nu_dbm": -70.0,
     "rho_dbm": -30.0,
     "pair": PairReading.WEAKER,
-    "foresee_s": 9.0,
 }
 
 
@@ -160,37 +155,11 @@ def test_a_tuning_sets_what_it_names_and_leaves_the_rest_to_the_file() -> None:
         assert getattr(spec if key in TUNED_RULES else spec.limits, key) == value
 
 
-def test_a_tuned_patience_is_not_learnt_and_a_learnt_one_is_told_as_none() -> None:
-    learning = replace(TASK, learns_patience=True)
-    assert learning.in_force(TUNING).patience is None
-    assert not learning.under(replace(TUNING, patience=0.7)).learns_patience
-
-
-@pytest.mark.parametrize("file", [(0.0, ScoreForm.SERVICE), (0.2, ScoreForm.SERVICE), (0.0, ScoreForm.PAPER)])
-@pytest.mark.parametrize(
-    ("network", "score", "patience"),
-    [(0.0, "service", None), (0.2, "service", RADIO_PATIENCE), (0.0, "paper", PAPER_PATIENCE), (1.0, "paper", 0.55)],
-)
-def test_a_patience_that_the_file_does_not_give_is_the_one_by_the_weights_and_the_score_in_force(
-    file: tuple[float, ScoreForm], network: float, score: str, patience: float | None
-) -> None:
-    def tuning(weight: float, form: ScoreForm) -> Tuning:
-        return replace(TUNING, weights=Weights(cpu=1.0 - weight, memory=0.0, network=weight), score=form)
-
-    tuned, own = tuning(network, ScoreForm(score)), tuning(*file)
-    given = default_patience(file[1], file[0])
-    task = replace(TASK, tuning=own, patience=0.15 if given is None else given, learns_patience=given is None)
-    assert task.under(own) == task
-    assert task.in_force(tuned).patience == patience
-    assert replace(task, patience=0.7, learns_patience=False).in_force(tuned).patience == 0.7, "the file gives one"
-    assert task.in_force(replace(tuned, patience=0.8)).patience == 0.8
-
-
 def test_ranges_are_those_of_the_file_and_a_signal_that_does_not_fit_the_file_is_left_out() -> None:
-    wrong: dict[str, Any] = {"max_moves_per_minute": 0, "memory_floor_ratio": 0.95, "foresee_s": 31.0, "nu_dbm": 1.0}
+    wrong: dict[str, Any] = {"price_s": -1.0, "memory_floor_ratio": 0.95, "nu_dbm": 1.0}
     for key, value in wrong.items():
         with pytest.raises(ValueError, match=key):
             replace(TUNING, **{key: value})
     for crossed in (replace(TUNING, nu_dbm=-30.0), replace(TUNING, nu_dbm=-50.0, rho_dbm=-50.0)):
-        limits = TASK.under(replace(crossed, foresee_s=9.0)).limits
-        assert (limits.nu_dbm, limits.rho_dbm, limits.foresee_s) == (-80.0, -40.0, 9.0)
+        limits = TASK.under(crossed).limits
+        assert (limits.nu_dbm, limits.rho_dbm) == (-80.0, -40.0)

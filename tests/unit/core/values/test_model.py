@@ -94,8 +94,6 @@ def test_not_measured_passes_a_range_and_nan_does_not() -> None:
         (lambda: Weights(cpu=0.5, memory=0.5, network=2e-6), "weights: the sum"),
         (lambda: Tuning(weights=EVEN, bonus=-0.01), "bonus"),
         (lambda: Tuning(weights=EVEN, bonus=1.01), "bonus"),
-        (lambda: Tuning(weights=EVEN, cool_down_s=-1.0), "cool_down_s"),
-        (lambda: Tuning(weights=EVEN, cool_down_s=86401.0), "cool_down_s"),
         (lambda: Link(source=LinkSource.FIXED, rssi_dbm=1.0), "link.rssi_dbm"),
         (lambda: Link(source=LinkSource.FIXED, rssi_dbm=-121.0), "link.rssi_dbm"),
         (lambda: Link(source=LinkSource.FIXED, bitrate_mbps=-1.0), "link.bitrate_mbps"),

@@ -21,7 +21,7 @@ SOME = Standing(aggregates={"edge1": 0.5, "edge2": 0.6}, vetoed={}, vectors=(), 
 def test_a_called_robot_answers_during_its_own_wait(is_called: bool, outcome: Outcome) -> None:
     judge = Judge(spec=SPEC)
     for now in (100.0, 100.0 + INITIAL_SETTLE_S / 2):
-        found = judge.judge(SOME, NOBODY, settled_for_s=0.0, escape=None, is_called=is_called, now=now)
+        found = judge.judge(SOME, NOBODY, escape=None, is_called=is_called, now=now)
         assert found.outcome is outcome
         assert found.candidate == ("edge2" if is_called else None)
 

@@ -12,10 +12,11 @@ from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.values.change import Retune
 from zsched.core.values.fleet import LinkLimits
-from zsched.core.values.model import Allocation, Reach, Tuning
+from zsched.core.values.model import Aggregate, Allocation, Reach, Tuning, Weights
 from zsched.core.vote.retuning import AGAIN_S, RANK_S, Retuning
 
 FILE = tuning_of(bonus=0.05)
+CPU, MEMORY = Weights(cpu=1.0, memory=0.0, network=0.0), Weights(cpu=0.0, memory=1.0, network=0.0)
 
 
 def wished(agreed: Tuning, before: dict[str, Any], after: dict[str, Any], *, me: str = "edge1") -> Tuning | None:
@@ -30,7 +31,7 @@ def wished(agreed: Tuning, before: dict[str, Any], after: dict[str, Any], *, me:
 
 
 def test_a_changed_setting_is_wanted_and_the_others_stay_as_they_were_tuned() -> None:
-    agreed = replace(FILE, cool_down_s=30.0, patience=0.7)
+    agreed = replace(FILE, aggregate=Aggregate.MEDIAN, price_s=0.7)
     assert wished(agreed, {}, {"tuning": replace(FILE, bonus=0.2)}) == replace(agreed, bonus=0.2)
     assert wished(agreed, {}, {"tuning": FILE}) is None
 
@@ -38,13 +39,12 @@ def test_a_changed_setting_is_wanted_and_the_others_stay_as_they_were_tuned() ->
 @pytest.mark.parametrize(
     ("tuned", "before", "after"),
     [
-        ({"patience": 0.7}, {"patience": 0.3}, {"patience": 0.4}),
-        ({"patience": 0.7}, {"patience": 0.3}, {"learns_patience": True}),
-        ({"max_moves_per_minute": 2}, {}, {"max_moves_per_minute": 9}),
+        ({"price_s": 0.7}, {"price_s": 0.3}, {"price_s": 0.4}),
+        ({"cpu_floor_ratio": 0.2}, {}, {"cpu_floor_ratio": 0.1}),
         ({"memory_floor_ratio": 0.3}, {}, {"memory_floor_ratio": 0.2}),
         ({"reach": Reach.MAJORITY}, {}, {"reach": Reach.ALL}),
         ({"nu_dbm": -70.0}, {}, {"limits": LinkLimits(nu_dbm=-75.0)}),
-        ({"foresee_s": 9.0}, {}, {"limits": LinkLimits(foresee_s=1.0)}),
+        ({"rho_dbm": -30.0}, {}, {"limits": LinkLimits(rho_dbm=-45.0)}),
     ],
 )
 def test_a_file_that_changes_a_tuned_setting_of_its_own_ends_the_tuning_of_it_alone(
@@ -60,16 +60,16 @@ def test_a_file_that_changes_a_tuned_setting_of_its_own_ends_the_tuning_of_it_al
 
 
 def test_a_file_that_changes_another_setting_leaves_the_tuned_one() -> None:
-    agreed = replace(FILE, patience=0.7)
-    assert wished(agreed, {"patience": 0.3}, {"patience": 0.3, "max_moves_per_minute": 2}) is None
-    spec = task_of(tuning=FILE, patience=0.3, max_moves_per_minute=2).under(agreed)
-    assert (spec.patience, spec.max_moves_per_minute) == (0.7, 2)
+    agreed = replace(FILE, price_s=0.7)
+    assert wished(agreed, {"price_s": 0.3}, {"price_s": 0.3, "reach": Reach.ALL}) is None
+    spec = task_of(tuning=FILE, price_s=0.3, reach=Reach.ALL).under(agreed)
+    assert (spec.price_s, spec.reach) == (0.7, Reach.ALL)
 
 
 def test_a_tuning_that_comes_between_is_the_newer_word() -> None:
-    old, new = fleet_of(task_of(tuning=FILE, patience=0.3)), fleet_of(task_of(tuning=FILE, patience=0.4))
-    value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, patience=0.7))
-    newer: Allocation = replace(value, revision=6, tuning=replace(FILE, patience=0.9))
+    old, new = fleet_of(task_of(tuning=FILE, price_s=0.3)), fleet_of(task_of(tuning=FILE, price_s=0.4))
+    value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, price_s=0.7))
+    newer: Allocation = replace(value, revision=6, tuning=replace(FILE, price_s=0.9))
     retuning = Retuning("edge2")
     retuning.adopt(old, new, {"merge": value}, 0.0)
     assert list(retuning.due({"merge": value}, 0.0)) == [], "the first in rank tries before this node"
@@ -79,7 +79,7 @@ def test_a_tuning_that_comes_between_is_the_newer_word() -> None:
 
 def test_a_second_changed_file_does_not_end_what_the_first_one_wants() -> None:
     """No quorum, or another node's turn: the second file differs from the first one only in what was changed last."""
-    tunings = (FILE, replace(FILE, cool_down_s=30.0), replace(FILE, cool_down_s=30.0, bonus=0.2))
+    tunings = (FILE, replace(FILE, aggregate=Aggregate.MEDIAN), replace(FILE, aggregate=Aggregate.MEDIAN, bonus=0.2))
     first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
     retuning = Retuning("edge2")
@@ -92,10 +92,10 @@ def test_a_second_changed_file_does_not_end_what_the_first_one_wants() -> None:
 
 
 def test_what_an_earlier_file_wanted_ends_with_a_tuning_that_came_between() -> None:
-    tunings = (FILE, replace(FILE, cool_down_s=30.0), replace(FILE, cool_down_s=30.0, bonus=0.2))
+    tunings = (FILE, replace(FILE, weights=CPU), replace(FILE, weights=CPU, bonus=0.2))
     first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
-    newer = replace(value, revision=6, tuning=replace(FILE, cool_down_s=7.0))
+    newer = replace(value, revision=6, tuning=replace(FILE, weights=MEMORY))
     retuning = Retuning("edge2")
     retuning.adopt(first, second, {"merge": value}, 0.0)
     retuning.adopt(second, third, {"merge": newer}, 0.1)
@@ -104,8 +104,8 @@ def test_what_an_earlier_file_wanted_ends_with_a_tuning_that_came_between() -> N
 
 
 def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() -> None:
-    old, new = fleet_of(task_of(tuning=FILE, patience=0.3)), fleet_of(task_of(tuning=FILE, patience=0.4))
-    value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, patience=0.7))
+    old, new = fleet_of(task_of(tuning=FILE, price_s=0.3)), fleet_of(task_of(tuning=FILE, price_s=0.4))
+    value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, price_s=0.7))
     retuning = Retuning("edge1")
     retuning.adopt(old, new, {"merge": value}, 0.0)
     wanted = [("merge", Retune(base_revision=5, tuning=FILE))]
@@ -119,7 +119,7 @@ def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() ->
 
 def test_a_second_file_wants_what_the_first_one_wanted_too() -> None:
     """Before the first wish is agreed the next file comes: neither change is lost, whichever is agreed first."""
-    tunings = FILE, replace(FILE, bonus=0.2), replace(FILE, bonus=0.2, cool_down_s=33.0)
+    tunings = FILE, replace(FILE, bonus=0.2), replace(FILE, bonus=0.2, aggregate=Aggregate.MEDIAN)
     files = [fleet_of(task_of(tuning=tuning)) for tuning in tunings]
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
     retuning = Retuning("edge2")

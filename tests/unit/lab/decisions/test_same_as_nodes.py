@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, PAPER_PATIENCE, Demand, Timing
+from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
 from zsched.core.values.model import Tuning
 from zsched_lab.decisions.loads import Array
 from zsched_lab.decisions.replay import Entry, replay
@@ -16,8 +15,8 @@ from zsched_lab.decisions.rules import CoreRule
 from zsched_lab.decisions.world import DT_S, EVEN, World, build_fleet
 from zsched_lab.sim.simulator import CORES, MEMORY_MB, Simulator
 
-SLOW = Tuning(weights=EVEN, cool_down_s=10.0)
-PATIENT = Tuning(weights=EVEN, cool_down_s=DEFAULT_COOL_DOWN_S, bonus=DEFAULT_BONUS)
+WIDE = Tuning(weights=EVEN)
+PLAIN = Tuning(weights=EVEN, bonus=DEFAULT_BONUS)
 MINUTES = 3
 STARTED_AT_S = 100.0
 """The simulator's clock at its start."""
@@ -49,7 +48,7 @@ def history(seed: int, scatter: float) -> World:
     )
 
 
-def by_nodes(world: World, tuning: Tuning, patience: float, *, learns: bool = False) -> list[tuple[float, str]]:
+def by_nodes(world: World, tuning: Tuning, price_s: float) -> list[tuple[float, str]]:
     """(time, owner) of every allocation that a fleet of full nodes learns."""
     column = {name: index for index, name in enumerate(world.candidates)}
     cpu, memory = world.cpu_read, world.memory_read
@@ -64,7 +63,7 @@ def by_nodes(world: World, tuning: Tuning, patience: float, *, learns: bool = Fa
         used, used_mb = _at(cpu, step, column[name]) * CORES, _at(memory, step, column[name]) * MEMORY_MB
         return used + own.cpu_cores, used_mb + own.memory_mb
 
-    task = replace(world.spec, tuning=tuning, patience=patience, learns_patience=learns)
+    task = replace(world.spec, tuning=tuning, price_s=price_s)
     sim = Simulator(fleet=replace(world.fleet, tasks=(task,)), seed=1, load=load)
     sim.start()
     learnt: list[tuple[float, str]] = []
@@ -84,20 +83,20 @@ def _at(table: Array, step: int, column: int) -> float:
 
 
 @pytest.mark.parametrize(
-    ("seed", "scatter", "tuning", "patience", "learns"),
+    ("seed", "scatter", "tuning", "price_s"),
     [
-        (1, 0.0, SLOW, PAPER_PATIENCE, False),
-        pytest.param(2, 0.03, PATIENT, PAPER_PATIENCE, False, marks=pytest.mark.long),
-        (2, 0.03, PATIENT, FIRST_PATIENCE, True),
+        (1, 0.0, WIDE, 1.0),
+        pytest.param(2, 0.03, PLAIN, 1.0, marks=pytest.mark.long),
+        (2, 0.03, PLAIN, 0.3),
     ],
 )
 def test_the_replay_makes_the_moves_that_full_nodes_make(
-    seed: int, scatter: float, tuning: Tuning, patience: float, *, learns: bool
+    seed: int, scatter: float, tuning: Tuning, price_s: float
 ) -> None:
     world = history(seed, scatter)
-    rule = Entry(name="zsched", make=lambda view: CoreRule(view, tuning, patience=patience, learns_patience=learns))
+    rule = Entry(name="zsched", make=lambda view: CoreRule(view, tuning, price_s=price_s))
     moves = replay(world, (rule,))["zsched"]
-    nodes = by_nodes(world, tuning, patience, learns=learns)
+    nodes = by_nodes(world, tuning, price_s)
 
     assert [move.owner for move in moves] == [owner for _, owner in nodes]
     assert len(moves) >= 4, "a history without moves shows nothing"

@@ -24,7 +24,7 @@ def fleet(tasks: int, edges: int) -> Fleet:
         task_of(
             f"task{index}",
             names,
-            tuning=Tuning(weights=EVEN, cool_down_s=5.0),
+            tuning=Tuning(weights=EVEN),
             demand=Demand(cpu_cores=0.25 * CORES, memory_mb=0.25 * MEMORY_MB),
             worker=WorkerSpec(command=("work",)),
         )

@@ -89,7 +89,7 @@ def test_the_map_grows_in_it() -> None:
 
 
 def test_a_long_event_is_told_to_its_end() -> None:
-    event = "  23.4 s  map_merge moves edge1 -> edge2 (epoch 2): edge2 leads by 0.2 for longer than the patience"
+    event = "  23.4 s  map_merge moves edge1 -> edge2 (epoch 2): edge1 owes 0.31 s more than edge2"
     lines = drawn(a_view(events=(*(f"event {index}" for index in range(9)), event)), 100, 30)
 
     beside = " ".join(line[50:].strip("│ ") for line in lines)

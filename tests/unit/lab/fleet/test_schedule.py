@@ -31,7 +31,7 @@ def test_random_schedule_does_not_depend_on_the_order_of_the_nodes() -> None:
     assert random_schedule(60.0, 1, NODES) == random_schedule(60.0, 1, NODES[::-1])
 
 
-def test_push_leaves_the_cool_down_between_two_moves_in_the_default_run() -> None:
+def test_push_leaves_time_between_two_moves_in_the_default_run() -> None:
     windows = push_schedule(60.0, seed=1)
 
     assert len(windows) == 3

@@ -14,8 +14,8 @@ from zsched.core.scheduler.standing import Standing
 from zsched_lab.paper.ruled_daemon import install
 from zsched_lab.paper.rules import EVERY_S, RANDOM_PERIOD_S, JudgeMaker, Rule, RuleName, RulePlan, read_plan
 
-TUNING = tuning_of(bonus=0.0, cool_down_s=0.0)
-SPEC = task_of(candidates=("e1", "e2", "e3"), tuning=TUNING, patience=0.0)
+TUNING = tuning_of(bonus=0.0)
+SPEC = task_of(candidates=("e1", "e2", "e3"), tuning=TUNING, price_s=0.0)
 OWNED = allocation_of(owner="e1", tuning=TUNING)
 VALUES = {"e1": 0.50, "e2": 0.52, "e3": 0.30}
 
@@ -29,9 +29,7 @@ def plan(tmp_path: Path) -> Path:
 
 def judged(judge: Judge, values: dict[str, float], now: float, *, is_called: bool = False) -> Judgement:
     standing = Standing(aggregates=values, vetoed={}, vectors=(), voters_heard=3)
-    return judge.judge(
-        standing, OWNED, settled_for_s=99.0, escape=None, is_called=is_called, now=now, damping=Damping()
-    )
+    return judge.judge(standing, OWNED, escape=None, is_called=is_called, now=now, damping=Damping())
 
 
 def test_undamped_is_the_products_argmax() -> None:
@@ -45,7 +43,7 @@ def test_undamped_forgets_what_damping_remembers_and_the_cap_of_moves() -> None:
     for at in range(20):
         damping.note_move("e2", has_failed=False, now=float(at))
     standing = Standing(aggregates=VALUES, vetoed={}, vectors=(), voters_heard=3)
-    given = {"settled_for_s": 99.0, "escape": None, "is_called": False, "now": 20.0, "damping": damping}
+    given = {"escape": None, "is_called": False, "now": 20.0, "damping": damping}
 
     assert Judge(spec=SPEC).judge(standing, OWNED, **given).outcome is not Outcome.PROPOSE  # type: ignore[arg-type]  # one dict for both
     assert JudgeMaker(name=RuleName.UNDAMPED)(spec=SPEC).judge(standing, OWNED, **given).outcome is Outcome.PROPOSE
@@ -128,7 +126,6 @@ def test_the_program_puts_the_rule_where_the_product_makes_its_judges(monkeypatc
         judge.judge(
             Standing(aggregates={"e1": 0.5, "e2": 0.49}, vetoed={}, vectors=(), voters_heard=3),
             replace(OWNED),
-            settled_for_s=9.0,
             escape=None,
             is_called=False,
             now=1.0,

@@ -7,7 +7,7 @@ import pytest
 
 from zsched.adapters.radio.network_profiler import parse_trace
 from zsched.config.load import load_fleet
-from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S
+from zsched.core.values.fleet import DEFAULT_BONUS
 from zsched.core.values.model import ScoreForm
 from zsched.errors import ConfigError
 from zsched_lab.fleet.runner import read_tree, write_fleet
@@ -149,12 +149,11 @@ def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenari
     assert spec.candidates
     family = SCHEMES[name].family
     if family is Family.OURS:
-        tuned = (spec.learns_patience, spec.tuning.bonus, spec.tuning.cool_down_s, spec.limits.foresee_s)
-        as_it_comes = (True, DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, DEFAULT_FORESEE_S)
-        assert tuned == as_it_comes, "the product as it comes"
+        tuned = (spec.price_s, spec.memory_s, spec.tuning.bonus)
+        assert tuned == (0.3, 200.0, DEFAULT_BONUS), "the product as it comes"
         assert spec.tuning.score is ScoreForm.SERVICE
     elif family is not Family.FIXED:
-        assert (spec.patience, spec.learns_patience, spec.limits.foresee_s) == (0.0, False, 0.0)
+        assert spec.price_s == 0.0
         assert spec.tuning.score is ScoreForm.PAPER, "the paper's schemes score as the paper does"
     if SCHEMES[name].weights is not None:
         assert (spec.tuning.weights.cpu, spec.tuning.weights.memory, spec.tuning.weights.network) == SCHEMES[
@@ -196,7 +195,6 @@ def test_the_robots_scenario_is_three_robots_by_the_radio_alone() -> None:
     task = tree["tasks"]["map_merge"]
     assert scheme_tree(tree, SCHEMES["zsched"])["tasks"]["map_merge"] == {**task, "candidates": sorted(tree["nodes"])}
     assert not {"scheduling", "link"} & set(task), "zsched is the product as it comes"
-    assert scheme_tree(tree, SCHEMES["dyna_net"])["tasks"]["map_merge"]["link"] == {"foresee_s": 0.0}
 
 
 # --- the radio -------------------------------------------------------------------------------------------------------

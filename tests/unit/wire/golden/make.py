@@ -31,7 +31,7 @@ from zsched.wire import codec as wire
 HERE = Path(__file__).parent
 
 _WEIGHTS = model.Weights(cpu=0.5, memory=0.25, network=0.25)
-_TUNING = model.Tuning(weights=_WEIGHTS, bonus=0.125, cool_down_s=7.0, aggregate=model.Aggregate.MEDIAN)
+_TUNING = model.Tuning(weights=_WEIGHTS, bonus=0.125, aggregate=model.Aggregate.MEDIAN)
 """Its frames hold a ``time_to_trigger_s`` as well, from when there was one: a field that is gone is read over."""
 _VALUE = model.Allocation(
     task="map_merge", revision=7, epoch=4, owner="edge1", tuning=_TUNING, pinned=True, paused=True
@@ -73,8 +73,8 @@ _DECISION = decision.Decision(
             reach=model.Reach.MAJORITY,
             memory_floor_ratio=0.05,
             max_moves_per_minute=6,
-            patience=0.15,
-            learns_patience=True,
+            price_s=0.3,
+            memory_s=200.0,
             start_deadline_s=20.0,
             has_command=True,
         ),
@@ -91,10 +91,6 @@ _DECISION = decision.Decision(
         first="other",
         judge=decision.JudgeMemory(
             not_ready_since=1230.25,
-            spent=0.125,
-            spent_at=1234.0,
-            players=(decision.PlayerMemory(owner="edge1", spent=0.0625, paid=1.5, moved_at=1200.5),),
-            watched_at=1234.0,
         ),
         damping=decision.DampingMemory(points=(("edge2", 2.0, 1200.0),), moves=((1200.5, True),)),
     ),

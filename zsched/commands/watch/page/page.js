@@ -175,7 +175,7 @@ function explained(body) {
   const titles = ["candidate", "joint", "bonus", "penalty", "total", ""];
   return h("div", { class: "explain" },
     h("p", {}, `${body.outcome} ${body.candidate || ""}: ${body.reason}`),
-    h("p", { class: "dim" }, `as ${body.node} judged it ${span(body.age_s)} ago · patience ${number(body.patience, 2)}, spent ${number(body.spent, 3)} · ${body.heard.length} robots heard, ${body.needed} needed`),
+    h("p", { class: "dim" }, `as ${body.node} judged it ${span(body.age_s)} ago · a move costs ${number(body.price_s, 1)} s · ${body.heard.length} robots heard, ${body.needed} needed`),
     h("div", { class: "scroll" }, h("table", {}, h("tr", {}, titles.map((title, at) => h("th", { class: at && at < 5 ? "number" : "" }, title))), rows)),
     body.changes.map((change) => h("p", {}, change)));
 }

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from zsched.core.scheduler import scoring
-from zsched.core.scheduler.patience import FIRST_PATIENCE
-from zsched.core.values.fleet import DEFAULT_BONUS, DEFAULT_COOL_DOWN_S, TaskSpec
+from zsched.core.values.fleet import DEFAULT_BONUS, TaskSpec
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched_lab.decisions import __main__ as package
 from zsched_lab.decisions import entries
 from zsched_lab.decisions.loads import Spikes
-from zsched_lab.decisions.rules import CoreRule, PickRule, TimedJudge
+from zsched_lab.decisions.rules import CoreRule, PickRule
 from zsched_lab.decisions.service import cast, command, picture, study, tables
 from zsched_lab.decisions.service import replay as closed
 from zsched_lab.decisions.service.history import MEASURED, History, build
@@ -107,16 +106,17 @@ def test_the_paper_s_score_here_is_zsched_of_the_other_study() -> None:
     other = entries.core(world)(made.view) if isinstance(made, CoreRule) else None
     assert isinstance(made, CoreRule)
     assert isinstance(other, CoreRule)
-    assert (made.tuning, made.patience) == (other.tuning, other.patience)
+    assert (made.tuning, made.price_s, made.memory_s) == (other.tuning, other.price_s, other.memory_s)
     assert ZSCHED.look == entries.ours(world)[0].look
 
 
 def test_the_service_rule_is_what_a_fleet_file_gets_that_says_nothing() -> None:
-    assert ZSCHED.changes == {"patience": FIRST_PATIENCE, "learns_patience": True}
-    assert (ZSCHED.tuning.bonus, ZSCHED.tuning.cool_down_s) == (DEFAULT_BONUS, DEFAULT_COOL_DOWN_S)
+    assert ZSCHED.changes == {}
+    assert ZSCHED.tuning.bonus == DEFAULT_BONUS
     made = ZSCHED.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
     assert isinstance(made, CoreRule)
-    assert [judge.spec.learns_patience for judge in made._judges] == [True] * 3
+    plain = spec_of(3)
+    assert {(judge.spec.price_s, judge.spec.memory_s) for judge in made._judges} == {(plain.price_s, plain.memory_s)}
 
 
 @pytest.mark.parametrize("name", [*PAPER_SCHEMES, "dyna_net"])
@@ -144,19 +144,17 @@ def spec_of(seed: int) -> TaskSpec:
 
 
 def test_a_rule_may_be_described() -> None:
-    player = cast.described("hasty:smoothing_s=0.5,patience=0.3,cool_down_s=1.5,aggregate=median")
+    player = cast.described("hasty:smoothing_s=0.5,price_s=0.4,memory_s=50,aggregate=median")
     assert (player.name, player.look.smoothing_s) == ("hasty", 0.5)
-    assert (player.tuning.cool_down_s, player.tuning.aggregate, player.changes["patience"]) == (1.5, "median", 0.3)
+    assert (player.tuning.aggregate, player.changes) == ("median", {"price_s": 0.4, "memory_s": 50.0})
     assert cast.described("new:score=service").tuning.score is ScoreForm.SERVICE
-    timer = cast.described("timer:time_to_trigger_s=2")
-    made = timer.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
+    made = player.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
     assert isinstance(made, CoreRule)
-    assert (made.time_to_trigger_s, timer.tuning.bonus, timer.tuning.cool_down_s) == (2.0, 0.1, 10.0)
-    assert {type(judge) for judge in made._judges} == {TimedJudge}
+    assert {(judge.spec.price_s, judge.spec.memory_s) for judge in made._judges} == {(0.4, 50.0)}
     for wrong in (
         "x:speed=3",
-        "x:patience",
-        ":patience=1",
+        "x:price_s",
+        ":price_s=1",
         "x:bonus=7",
         "x:demand=1",
         "x:exclusive=maybe",
@@ -208,14 +206,14 @@ def test_a_resumed_run_plays_what_is_missing_only() -> None:
     known = [row for case in study.cases(*asked, rules, []) for row in study.play(case)]
     assert len(known) == 4
     assert study.cases(*asked, rules, known) == []
-    (one, two) = study.cases(*asked, (*rules, "new:patience=0.3"), known)
-    assert one.rules == two.rules == ("new:patience=0.3",)
+    (one, two) = study.cases(*asked, (*rules, "new:price_s=0.3"), known)
+    assert one.rules == two.rules == ("new:price_s=0.3",)
     dearer = study.cases([5], HOURS, (15.0,), [1], (0.3, 1.0), rules, known)
     assert [(case.rules, case.prices_s) for case in dearer] == [(rules, (1.0,))], "no row comes twice"
 
 
 def test_tables_and_picture_say_what_the_rows_say(tmp_path: Path) -> None:
-    rules = (*study.YARDSTICKS, "dyna_both", "new:patience=0.3")
+    rules = (*study.YARDSTICKS, "dyna_both", "new:price_s=0.3")
     made = study.cases([105, 106], HOURS, (0.0, 15.0), [1], (0.3, 1.0), rules, [])
     rows = [row for case in made for row in study.play(case)]
     text = tables.report(rows)
@@ -244,7 +242,7 @@ def test_the_command_keeps_seeds_and_results_apart(tmp_path: Path, capsys: pytes
     assert "there are 1, 3" in capsys.readouterr().err
     assert command.parse(["--seeds", "train"]).seeds[0] in study.TRAIN
     quick = ["--out", str(tmp_path), "--loads", "0", "--tasks", "1", "--prices", "0.3", "--hours", "0.01"]
-    quick += ["--rule", "new:patience=0.3", "--only", "new;fixed, mean"]
+    quick += ["--rule", "new:price_s=0.3", "--only", "new;fixed, mean"]
     command.main([*quick, "--seeds", "107"])
     assert "| new |" in capsys.readouterr().out
     assert (tmp_path / "service-test.png").exists()
@@ -278,7 +276,7 @@ def test_a_task_that_fits_stays_on_one_of_several_equal_machines(seed: int) -> N
 
 
 def test_without_what_holds_a_task_noise_moves_it_between_equal_machines() -> None:
-    _, moves = moved(1, "loose:bonus=0,patience=0,cool_down_s=0", hours=0.03)
+    _, moves = moved(1, "loose:bonus=0,price_s=0", hours=0.03)
     assert moves > 5
 
 
