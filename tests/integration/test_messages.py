@@ -1,4 +1,4 @@
-"""What a newcomer is told: every command of docs/develop/messages.md is typed, and says what the page says."""
+"""What a newcomer is told: every command of tests/integration/messages.md is typed, and says what the page says."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from zsched.commands.example import Example, write_example
 pytestmark = pytest.mark.long
 
 REPO = Path(__file__).parents[2]
-PAGE = REPO / "docs" / "develop" / "messages.md"
+PAGE = REPO / "tests" / "integration" / "messages.md"
 CLI = (sys.executable, "-m", "zsched.cli")
 QUOTED = re.compile(r"(`+)\s?(.+?)\s?\1(?!`)")
 DEAF = "import time\ntime.sleep(3600)\n"

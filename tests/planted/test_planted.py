@@ -42,7 +42,7 @@ def test_there_are_enough_bugs_each_with_a_name_of_its_own_and_tests_that_exist(
 
 
 def test_the_page_of_membership_rules_names_bugs_that_are_planted() -> None:
-    rows = (ROOT / "docs/develop/membership-rules.md").read_text(encoding="utf-8").splitlines()
+    rows = (ROOT / "tests/planted/membership-rules.md").read_text(encoding="utf-8").splitlines()
     cells = [row.split("|")[3] for row in rows if row.startswith("| ") and not row.startswith(("| rule", "| ---"))]
     named = [name.strip() for cell in cells for name in cell.split(";")]
     assert len(named) > 30
