@@ -34,7 +34,7 @@ def _named(names: list[str]) -> str:
 
 def told(spec: TaskSpec, timing: Timing) -> list[str]:
     """One sentence per setting, each with its key in the fleet file."""
-    return [*_worth(spec), *_when(spec, timing), *_bounds(spec), *_links(spec)]
+    return [*_worth(spec), *_when(spec, timing), *_links(spec)]
 
 
 def _worth(spec: TaskSpec) -> Iterator[str]:
@@ -106,6 +106,7 @@ def _when(spec: TaskSpec, timing: Timing) -> Iterator[str]:
     )
     followed = "; ".join(f"by {lead:g} {_left(spec, timing, lead)}" for lead in LEADS)
     yield f"it leaves an owner that a load puts behind another candidate {followed}; {ON_TOP}"
+    yield f"it moves at most {spec.max_moves_per_minute} times a minute, from failures {ESCAPES_PER_MINUTE} times"
 
 
 def _left(spec: TaskSpec, timing: Timing, lead: float) -> str:
@@ -113,11 +114,6 @@ def _left(spec: TaskSpec, timing: Timing, lead: float) -> str:
     if lead <= spec.tuning.bonus:
         return "never"
     return f"after about {left_after_s(lead - spec.tuning.bonus, spec.price_s, timing.smoothing_s):.2g} s"
-
-
-def _bounds(spec: TaskSpec) -> Iterator[str]:
-    """How often it moves at most."""
-    yield f"it moves at most {spec.max_moves_per_minute} times a minute, from failures {ESCAPES_PER_MINUTE} times"
 
 
 def _links(spec: TaskSpec) -> Iterator[str]:

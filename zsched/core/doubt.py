@@ -1,6 +1,6 @@
 """A machine that disappointed for no visible cause: for how long it is avoided before it is tried again.
 
-Knows: times. Does not know: of what it is a doubt (`zsched.core.gateway.shortfall`, `zsched.core.scheduler.rested`).
+Knows: times. Does not know: of what it is a doubt (`zsched.core.scheduler.rested`).
 
 What has a cause that is seen ends with it. What has none would be believed for good, or be forgotten and found again
 without end. So it counts for a minute, and twice as long each time that a trial fails (exponential backoff).

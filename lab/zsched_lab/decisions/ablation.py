@@ -11,10 +11,11 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from zsched.core.gateway import demand, sharing, shortfall, task_speed
+from zsched.core.gateway import demand
 from zsched.core.gateway.job_need import JobNeed
 from zsched.core.gateway.sharing import Shares
 from zsched.core.scheduler import utility
+from zsched.core.scheduler.kept import Kept
 from zsched_lab.decisions.__main__ import main
 
 Switch = tuple[Any, str, Any]
@@ -34,16 +35,14 @@ def _at_without_experience(shares: Shares, *given: Any) -> float:
 
 _AT: Final = Shares.at
 SWITCHES: Final[Mapping[str, tuple[Switch, ...]]] = {
-    "task-speeds": ((task_speed.TaskSpeeds, "note", _always(None)),),
-    "shortfalls": ((shortfall.Shortfalls, "note", _always(False)),),
-    "doubts": ((shortfall, "_waits", _always(True)),),
+    "kept": ((Kept, "corrected", lambda _kept, worth, *_more: dict(worth)),),
+    "seen-lack": ((demand.Demands, "given_ratio", _always(1.0)),),
+    "seen-age": ((demand.Demands, "seen_s", _always(0.0)),),
     "fair-share": ((Shares, "at", _always(0.0)),),
     "kept-share": ((Shares, "at", _at_without_experience),),
-    "others-beside": ((getattr(sharing, "_Others"), "expected", lambda _known, seen: seen),),  # noqa: B009 - as above
     "settling": ((demand, "SETTLE_S", 0.0),),
     "calm": ((demand, "CALM_S", 0.0),),
     "guess": ((demand, "UNSURE", 1.0),),
-    "compared": ((demand, "COMPARED_S", -1.0),),
     "told-lack": ((demand, "_told", _always(None)),),
     "one-thread": ((JobNeed, "most_cores", _always(None)),),
     "least-need": ((utility, "LEAST_NEED_RATIO", 0.0),),

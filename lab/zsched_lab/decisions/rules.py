@@ -56,7 +56,7 @@ class CoreRule:
     view: Sight
     tuning: Tuning
     price_s: float = 0.3
-    memory_s: float = 200.0
+    memory_s: float = 1000.0
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)

@@ -35,7 +35,7 @@ def test_every_setting_is_named_with_its_key() -> None:
     ("spec", "said"),
     [
         (SPEC, "once its own one owes 0.3 s more (price_s)"),
-        (SPEC, "half of it forgotten in 200 s (memory_s), and will lose in 1.5 s"),
+        (SPEC, "half of it forgotten in 1000 s (memory_s), and will lose in 1.5 s"),
         (SPEC, "counts 0.05 more (bonus)"),
         (SPEC, "by 0.5 after about 0.28 s; by 0.1 after about 7.8 s"),
         (replace(SPEC, tuning=replace(RADIO, bonus=0.2)), "; by 0.1 never"),

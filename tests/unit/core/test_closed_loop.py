@@ -186,6 +186,7 @@ class Loop:
     timing: Timing = field(default_factory=Timing)
     robots: tuple[str, ...] = ("robot1",)
     price_s: float = 0.3
+    memory_s: float = 1000.0
     demand: Demand = Demand()
     """By the fleet file."""
     seed: int = 0
@@ -198,6 +199,7 @@ class Loop:
             tuning=replace(self.tuning, weights=self.weights),
             demand=self.demand,
             price_s=self.price_s,
+            memory_s=self.memory_s,
         )
         fleet = fleet_of(self.spec, of=(*names, *self.robots), timing=self.timing)
         self.allocation = allocation_of(owner=names[0], tuning=self.spec.tuning)
@@ -310,7 +312,7 @@ def test_the_same_noise_without_stickiness_moves_the_task_all_the_time() -> None
     """The control: the harness can fail."""
     machines = (Machine(name="edge1", noise=0.15), Machine(name="edge2", noise=0.15))
 
-    assert len(Loop(machines, tuning=RESTLESS, price_s=0.0).run(120.0)) > 10
+    assert len(Loop(machines, tuning=RESTLESS, price_s=0.0, memory_s=1.0).run(120.0)) > 10
 
 
 # --- a step --------------------------------------------------------------------------------------------------------
@@ -394,7 +396,7 @@ def test_without_the_demand_correction_the_same_task_oscillates() -> None:
         Machine(name=name, base=0.2, task_cores=1.6, task_mb=1200.0, shows_worker=False) for name in ("edge1", "edge2")
     )
 
-    assert len(Loop(machines).run(THOUSAND_ROUNDS_S)) > 20
+    assert len(Loop(machines, memory_s=1.0).run(THOUSAND_ROUNDS_S)) > 20
 
 
 @pytest.mark.parametrize("threads", [None, 0.0])
@@ -558,7 +560,7 @@ TOO_SLOW = (
 def test_where_the_benchmark_says_little_of_a_task_it_comes_to_rest_all_the_same(
     machines: tuple[Machine, ...], weights: Weights, job_s: float | None, deadline_ms: float | None
 ) -> None:
-    """By the benchmark alone the first five are limit cycles of 38 to 79 moves (docs/decisions/0118)."""
+    """By the benchmark alone the first five are limit cycles of 38 to 79 moves."""
     for machine in machines:
         machine.job_s = job_s
     tuning = replace(BY_SERVICE, deadline_ms=None if job_s is None else deadline_ms)

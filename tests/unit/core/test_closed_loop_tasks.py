@@ -294,7 +294,7 @@ def test_where_nothing_changes_several_tasks_come_to_rest(
 ) -> None:
     """Each may go once to each machine, to learn what it gets there. A slight lead may take minutes to cost a move.
 
-    The examples were limit cycles of 47, 4 and 60 moves in 300 s (docs/decisions/0124).
+    The examples were limit cycles of 47, 4 and 60 moves in 300 s.
     """
     machines, works, owners = fleet
     moves = Tasks(machines, works, owners, weights).run(400.0)

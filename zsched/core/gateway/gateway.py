@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from zsched.core.gateway.demand import Demands
+from zsched.core.gateway.demand import Demands, speed_of
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
 from zsched.core.values.fleet import Demand, Fleet, TaskSpec
@@ -50,7 +50,6 @@ class Gateway:
         for known in (self._profiles, self._tracks, self._readings):
             for name in [name for name in known if name not in self._names]:
                 del known[name]
-        self.demands.keep(self._names)
         self._shares.keep(self._names)
         self.version += 1
 
@@ -107,7 +106,7 @@ class Gateway:
         spec = self._tasks.get(task)
         candidates = () if spec is None else spec.candidates
         heard_now = (self.fresh(name, now) for name in candidates)  # a machine that is gone would do none of it
-        fastest = max((self.demands.speed(task, one) for one in heard_now if one is not None), default=None)
+        fastest = max((speed_of(one) for one in heard_now if one is not None), default=None)
         if self.demands.is_replaced(task, profile):
             self.forget(task)
         has_share = self._shares.learn(task, profile, now)
@@ -119,9 +118,7 @@ class Gateway:
         for name in self._shares.left_by(task, owner):
             left = self.fresh(name, now)
             has_share |= left is not None and self._shares.look_back(task, left, now)
-        # What a job takes there is compared with what `score` foretells, so by the same share.
-        fair = 0.0 if spec is None else self.share(spec, profile, self.demand(spec, profile).cpu_cores, 0.0)
-        has_need = self.demands.learn(task, profile, now, fastest, fair)
+        has_need = self.demands.learn(task, profile, now, fastest)
         self.version += has_need or has_share
 
     def forget(self, task: TaskId) -> None:

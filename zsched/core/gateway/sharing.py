@@ -7,9 +7,6 @@ A fair scheduler (CFS, EEVDF) gives the same to every thread that wants to run. 
 been there. From then on the ratio of what it got to its fair share counts for that machine, and how many of its threads
 wanted to run there: on a quick machine fewer do. Otherwise two machines that both promise more than they give would
 pass the task back and forth for ever.
-
-Others' threads that rest now and then wait longer beside the task. Without it a machine shows fewer that want to run
-than the task would find there, so how many more they were is remembered, too (docs/decisions/0124).
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Container
 from typing import Final, Self
 
-from zsched.core.gateway.company import SAME_RATIO, STARVED_CPU_RATIO, is_full, others_cores
+from zsched.core.gateway.company import STARVED_CPU_RATIO, is_full, others_cores
 from zsched.core.gateway.demand import SETTLE_S
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
 from zsched.core.gateway.shortfall import is_short
@@ -61,27 +58,6 @@ class _Got(Struct, frozen=True):
     """Since when they do not any more; ``None``: they do, or never did."""
 
 
-class _Others(Struct, frozen=True):
-    """Others' threads on a machine that wanted to run beside a task."""
-
-    beside: float
-    cores: float
-    """What others used then."""
-    own: float
-    """The task's threads that ran or waited then."""
-    machine_cores: float
-    seen_at: float
-    """When the task was last seen at work there."""
-    left_at: float | None = None
-    """When it was first seen not to be; ``None``: it has not been."""
-    more: float = 0.0
-    """So many more they were than without it."""
-
-    def expected(self, seen: float) -> float:
-        """How many would want to run beside the task, where so many do now: no more than were found, or are there."""
-        return seen if self.left_at is None else max(seen, min(seen + self.more, self.beside))
-
-
 class _Unmeasured(Struct, frozen=True):
     """A worker of which nobody measures anything, on its owner."""
 
@@ -107,7 +83,6 @@ class Shares:
     """One node's experience of what tasks get of full machines."""
 
     def __init__(self) -> None:
-        self._others: dict[tuple[TaskId, NodeId], _Others] = {}
         self._threads: dict[TaskId, float] = {}
         """How many of a task's threads wanted to run where it lacked CPU last."""
         self._without: dict[tuple[TaskId, NodeId], float] = {}
@@ -120,17 +95,15 @@ class Shares:
 
         A worker that starts does other work, by other threads: that tells nothing of the task.
         """
-        load, key, used = profile.worker(task), (task, profile.node), others_cores(task, profile)
+        load, key = profile.worker(task), (task, profile.node)
         has_changed = self._look_unmeasured(key, profile, now)
-        if load is None or load.state is not WorkerState.READY or profile.runnable is None or used is None:
+        if load is None or load.state is not WorkerState.READY or profile.runnable is None:
             return has_changed
-        is_lacking = _is_hungry(load) or _is_held_up(profile, load)
+        if load.cpu_cores is None or not (_is_hungry(load) or _is_held_up(profile, load)):
+            return has_changed
         threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
-        own = threads if is_lacking and load.runnable is None else threads_of(load)
+        own = threads if load.runnable is None else threads_of(load)
         others = max(profile.runnable - own, 0.0)
-        self._others[key] = _Others(others, used, own, profile.cpu_cores, now)
-        if load.cpu_cores is None or not is_lacking:
-            return has_changed
         kept = min(load.cpu_cores / fair_share(profile.cpu_cores, threads, others), 1.0)
         before, got = self._got.get(key), _Got(threads, kept, profile.cpu_cores)
         self._threads[task], self._got[key] = threads, got
@@ -174,21 +147,16 @@ class Shares:
         return own, others
 
     def left_by(self, task: TaskId, owner: NodeId) -> tuple[NodeId, ...]:
-        """The nodes on which the task was, but for its ``owner``."""
-        nodes = dict.fromkeys(node for known in (self._others, self._got) for name, node in known if name == task)
-        return tuple(node for node in nodes if node != owner)
+        """The nodes on which the task was short, but for its ``owner``."""
+        return tuple(node for name, node in self._got if name == task and node != owner)
 
     def look_back(self, task: TaskId, profile: Profile, now: float) -> bool:
-        """Note what others do where the task was and is no more; whether that has changed anything."""
-        has_ended = self._watch_crowd((task, profile.node), profile, now)
-        return self._watch_others(task, profile, now) or has_ended
-
-    def _watch_crowd(self, key: tuple[TaskId, NodeId], profile: Profile, now: float) -> bool:
         """Forget what the task got beside others that filled the machine, when they have ended: the next share anew.
 
         A machine that only the task fills is not judged: nobody sees from outside whether it would keep its promise.
         """
-        got, others = self._got.get(key), others_cores(key[0], profile)
+        key = (task, profile.node)
+        got, others = self._got.get(key), others_cores(task, profile)
         if got is None or others is None:
             return False
         is_crowded = others >= STARVED_CPU_RATIO * profile.cpu_cores
@@ -199,37 +167,11 @@ class Shares:
         self._got[key] = replace(got, is_crowded=is_crowded or got.is_crowded, calm_at=calm_at)
         return False
 
-    def _watch_others(self, task: TaskId, profile: Profile, now: float) -> bool:
-        """Note how many others want to run there; whether that has changed anything.
-
-        Its worker may go on for long: until the next owner's is ready, and to drain. Threads that only rest use as much
-        without the task as beside it, or more. Others that use less have ended, and nobody knows who was who.
-        """
-        key, load, used = (task, profile.node), profile.worker(task), others_cores(task, profile)
-        known = self._others.get(key)
-        if known is None or profile.runnable is None or used is None:
-            return False
-        own = 0.0 if load is None else threads_of(load)
-        if known.left_at is None and own > known.own / 2:
-            self._others[key] = replace(known, seen_at=now)
-            return False
-        left_at = now if known.left_at is None else known.left_at
-        if now - left_at > LEFT_S:
-            return False
-        has_been_away = known.left_at is None and now - known.seen_at > LEFT_S
-        if has_been_away or used < known.cores - SAME_RATIO * profile.cpu_cores:
-            del self._others[key]
-            return True
-        more = max(known.beside - max(profile.runnable - own, 0.0), known.more)  # who comes meanwhile hides it
-        self._others[key] = replace(known, left_at=left_at, more=more)
-        return (left_at, more) != (known.left_at, known.more)
-
     def keep(self, nodes: Container[NodeId]) -> None:
         """Know nothing of other nodes: one of the same name that comes later is another one."""
         self._without = {key: seen for key, seen in self._without.items() if key[1] in nodes}
         self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[1] in nodes}
         self._got = {key: got for key, got in self._got.items() if key[1] in nodes}
-        self._others = {key: others for key, others in self._others.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
@@ -237,7 +179,6 @@ class Shares:
         self._without = {key: seen for key, seen in self._without.items() if key[0] != task}
         self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[0] != task}
         self._got = {key: got for key, got in self._got.items() if key[0] != task}
-        self._others = {key: others for key, others in self._others.items() if key[0] != task}
 
     def at(self, task: TaskId, profile: Profile, need_cores: float, coming_cores: float = 0.0) -> float:
         """Cores that the task would get on the node of ``profile`` if it were full; 0 where threads are not counted.
@@ -256,9 +197,7 @@ class Shares:
             got = _Got(self._threads.get(task, max(need_cores, 1.0)), 1.0, cores)
         load = profile.worker(task)
         own = 0.0 if load is None else threads_of(load)
-        known, others = self._others.get((task, profile.node)), max(profile.runnable - own, 0.0)
-        others = others if known is None or known.machine_cores != cores else known.expected(others)
-        return got.kept * fair_share(cores, got.threads, others + coming_cores)
+        return got.kept * fair_share(cores, got.threads, max(profile.runnable - own, 0.0) + coming_cores)
 
 
 def _is_hungry(load: WorkerLoad) -> bool:

@@ -34,6 +34,8 @@ class Decided(Struct, frozen=True, kw_only=True):
     """How many robots' utilities this decision needs."""
     expected: Mapping[NodeId, float]
     """{who can have the task: seconds of work that it owes, with what it will lose}."""
+    given: Mapping[NodeId, float]
+    """{candidate: what it is worth by what it has kept (`zsched.core.scheduler.kept`)}."""
     takes_turns: bool = False
     """It waits for other tasks' moves: a planned one, or a flight from short memory."""
     is_waiting_its_turn: bool = False
@@ -98,6 +100,7 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
         leaving=escape or (f"{allocation.owner} is {figures.drained}" if figures.drained else None),
         needed=needed,
         expected=judge.ledger.expected({name: 1.0 - one for name, one in judgement.aggregates.items()}),
+        given=judge.kept.corrected(standing.aggregates, allocation.owner, judge.spec.memory_s, figures.now),
         takes_turns=takes_turns,
         is_waiting_its_turn=is_waiting,
     )

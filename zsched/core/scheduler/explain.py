@@ -46,12 +46,14 @@ class RobotView(Struct, frozen=True, kw_only=True):
 
 
 class CandidateSum(Struct, frozen=True, kw_only=True):
-    """``max(joint + bonus - penalty, 0) = total``; ``None`` where the candidate cannot have the task."""
+    """``max(joint - unkept + bonus - penalty, 0) = total``; ``None`` where the candidate cannot have the task."""
 
     node: NodeId
     is_owner: bool
     joint: float | None
     """Mean or median of the robots' utilities."""
+    unkept: float
+    """What the machine promised so before, and did not give (`zsched.core.scheduler.kept`)."""
     bonus: float
     penalty: float
     total: float | None
@@ -222,15 +224,17 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
         joint = standing.aggregates.get(name)
         bonus = tuning.bonus if name == owner and not is_left else 0.0
         penalty, need = penalties.get(name, 0.0), needs.get(name)
+        unkept = 0.0 if joint is None else joint - again.given[name]
         is_out = joint is None or is_left
         found.append(
             CandidateSum(
                 node=name,
                 is_owner=name == owner,
                 joint=joint,
+                unkept=unkept,
                 bonus=bonus,
                 penalty=penalty,
-                total=None if is_out or joint is None else max(joint + bonus - penalty, 0.0),
+                total=None if is_out or joint is None else max(joint - unkept + bonus - penalty, 0.0),
                 owed_s=again.expected.get(name),
                 why_not=again.leaving or "" if is_left else standing.vetoed.get(name, ""),
                 need_cpu_cores=None if need is None else need.cpu_cores,
@@ -303,7 +307,7 @@ def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[C
         assert one.total is not None
         assert one.joint is not None
         if rounded(one.total) <= rounded(owner.total):
-            worth = math.ceil((needed + one.penalty) * _SHOWN) / _SHOWN
+            worth = math.ceil((needed + one.penalty + one.unkept) * _SHOWN) / _SHOWN
             lack, way = worth - one.joint, "or the"
             if worth <= 1.0:
                 yield f"{one.node} would have to be worth {worth:.4f} instead of {one.joint:.4f} ({lack:+.4f})"

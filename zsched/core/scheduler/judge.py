@@ -17,6 +17,7 @@ from typing import Final
 
 from zsched.core.absence import Absences
 from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
+from zsched.core.scheduler.kept import Kept
 from zsched.core.scheduler.ledger import Ledger
 from zsched.core.scheduler.standing import LOST_S, Standing, joined, rounded
 from zsched.core.values.decision import JudgeMemory
@@ -71,6 +72,7 @@ class Judge:
     lost: Absences = dataclasses.field(default_factory=Absences)
     """Of the owner from where the robots reach."""
     ledger: Ledger = dataclasses.field(default_factory=Ledger)
+    kept: Kept = dataclasses.field(default_factory=Kept)
     seen_first_at: float | None = None
     """When a first candidate could be scored (a task that nobody owns waits for the others)."""
 
@@ -96,6 +98,7 @@ class Judge:
             since = self.absences.since
             self.absences = _of_worker(None if since is None else since + self.held_s)
         self.spec = spec
+        self.kept.keep(spec.candidates)
 
     def not_ready_for(self, profile: Profile | None, now: float) -> float:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
@@ -129,6 +132,7 @@ class Judge:
         return JudgeMemory(
             owed=tuple(sorted(self.ledger.owed.items())),
             charged_at=self.ledger.at,
+            kept=self.kept.memory(),
             not_ready_since=self.absences.since,
             away_s=self.absences.total_s,
             away_until=self.absences.back_at,
@@ -143,7 +147,7 @@ class Judge:
         """Remember that, and nothing else."""
         self.lost = Absences(since=memory.lost_since, total_s=memory.lost_s, back_at=memory.reached_at)
         self.absences = _of_worker(memory.not_ready_since, memory.away_s, memory.away_until)
-        self.ledger = Ledger(owed=dict(memory.owed), at=memory.charged_at)
+        self.ledger, self.kept = Ledger(owed=dict(memory.owed), at=memory.charged_at), Kept.of(memory.kept)
         self.seen_first_at, self.fit_since = memory.seen_first_at, memory.fit_since
 
     def judge(
@@ -175,9 +179,11 @@ class Judge:
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
         penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
+        self.kept.look(standing.aggregates, owner, now)
+        given = self.kept.corrected(standing.aggregates, owner, self.spec.memory_s, now)
         worth = {
             name: max(value + (allocation.tuning.bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
-            for name, value in standing.aggregates.items()
+            for name, value in given.items()
         }
         home = allocation.home
         scored = {

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 
-from zsched.core.gateway.demand import Demands
+from zsched.core.gateway.demand import Demands, speed_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.eligibility import has_living_owner, is_far_beyond, may_return, refusal
@@ -218,7 +218,10 @@ class _View:
         # what an owner that is short gets is measured
         is_measured = candidate == allocation.owner and load is not None and is_short(load)
         least = min(fair, own.cpu_cores) if is_measured else fair
-        cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, least, fair)
+        seen_s = gateway.demands.seen_s(spec.name, profile, now) if candidate == allocation.owner else 0.0
+        cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, seen_s, least, fair)
+        if is_measured and cpu is not None and allocation.tuning.score is ScoreForm.SERVICE:
+            cpu = min(cpu, gateway.demands.given_ratio(spec.name, profile, now))
         memory = _memory(spec, profile, demand, use, allocation.tuning.score)
         weighed, at_limit = _gauges(allocation, gauges), link is not None and link.at_limit
         return _Terms(cpu, memory, None if link is None else link.utility, weighed, at_limit)
@@ -326,13 +329,15 @@ def _cpu(
     tuning: Tuning,
     demands: Demands,
     network_s: float,
+    seen_s: float,
     least_cores: float,
     fair_cores: float,
 ) -> float | None:
     """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline.
 
-    ``least_cores``: it gets at least this if it needs it, however full the machine is. ``fair_cores``: a job gets at
-    least this while it runs. Between its jobs a task uses nothing, so that may be far more than it needs on the mean.
+    ``seen_s``: its jobs are seen to take this there. ``least_cores``: it gets at least this if it needs it, however
+    full the machine is. ``fair_cores``: a job gets at least this while it runs. Between its jobs a task uses nothing,
+    so that may be far more than it needs on the mean.
     """
     used = use.cpu_cores
     if used is None:
@@ -340,13 +345,12 @@ def _cpu(
     if tuning.score is ScoreForm.PAPER:
         return cpu_utility(profile.cpu_cores, used)
     free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
-    share, stretch = demands.shortfalls.of(spec.name, profile)
-    share *= spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
+    share = spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
     if job is None:
         return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)
-    speed = demands.speed(spec.name, profile)
+    speed = speed_of(profile)
     if tuning.deadline_ms is not None:
-        job_s = stretch * job.age_s(speed, max(free, fair_cores)) + network_s
+        job_s = max(job.age_s(speed, max(free, fair_cores)), seen_s) + network_s
         share *= timely_worth(on_time(job_s, tuning.deadline_ms / 1e3))
     most = job.most_cores(speed, demand.cpu_cores)
     return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, most=most, share=share)

@@ -22,10 +22,21 @@ class Rules(Struct, frozen=True, kw_only=True):
     memory_floor_ratio: float
     max_moves_per_minute: int
     price_s: float = 0.3
-    memory_s: float = 200.0
+    memory_s: float = 1000.0
     start_deadline_s: float
     has_command: bool
     """Whether zsched starts the worker."""
+
+
+class KeptMemory(Struct, frozen=True, kw_only=True):
+    """What machines have kept of what they promised (`zsched.core.scheduler.kept.Kept`)."""
+
+    owner: NodeId | None = None
+    since: float = 0.0
+    foretold: tuple[tuple[NodeId, float], ...] = ()
+    """(machine, worth), sorted."""
+    seen: tuple[tuple[NodeId, float, float, float], ...] = ()
+    """(machine, what it promised, what it gave, when), sorted."""
 
 
 class JudgeMemory(Struct, frozen=True, kw_only=True):
@@ -34,6 +45,7 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
     owed: tuple[tuple[NodeId, float], ...] = ()
     """(machine, seconds of work), sorted."""
     charged_at: float | None = None
+    kept: KeptMemory = KeptMemory()
     not_ready_since: float | None = None
     away_s: float = 0.0
     away_until: float | None = None

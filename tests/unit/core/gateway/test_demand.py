@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -364,31 +363,30 @@ def test_the_wait_for_a_turn_is_what_it_is_where_nothing_is_short() -> None:
     assert age_s() == pytest.approx(0.3)
 
 
-def test_a_task_that_gets_less_than_its_machine_s_figures_say_is_remembered_there() -> None:
+def test_what_a_task_is_seen_to_get_counts_though_its_machine_s_figures_are_fine() -> None:
     """Half of its jobs are left undone beside two idle cores (it is pinned, or has a quota of its own)."""
     demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
     demands.learn("merge", pinned, 0.0)
-    assert demands.shortfalls.of("merge", pinned) == (1.0, 1.0), "it has just come"
-    assert demands.learn("merge", pinned, EVERY_S), "its need is the same, and it is scored anew all the same"
-    assert not demands.learn("merge", pinned, EVERY_S)
-    share, stretch = demands.shortfalls.of("merge", pinned)
-    assert share == pytest.approx(5 / 9)
-    assert stretch == pytest.approx(2.0)
-    left = profile(0.0, cpu=1.5)
-    assert demands.shortfalls.of("merge", left) == (share, stretch), "it does not look better once the task has left"
-    assert demands.shortfalls.of("merge", profile(0.0, cpu=1.0)) == (1.0, 1.0), "another load may be another story"
-    assert demands.shortfalls.of("merge", profile(0.0, cpu=1.5, node="edge2")) == (1.0, 1.0)
-    assert demands.shortfalls.of("merge", profile(0.0, cpu=None)) == (1.0, 1.0), "nobody knows what others use"
+    assert demands.given_ratio("merge", pinned, 0.0) == 1.0, "it has just come"
+    demands.learn("merge", pinned, EVERY_S)
+    assert demands.given_ratio("merge", pinned, EVERY_S) == pytest.approx(5 / 9)
+    assert demands.given_ratio("merge", profile(0.0, cpu=1.5, node="edge2"), EVERY_S) == 1.0
+    assert demands.given_ratio("slam", pinned, EVERY_S) == 1.0
     demands.learn("merge", told(9.0, used=2.0), 2 * EVERY_S)
-    assert demands.shortfalls.of("merge", pinned) == (1.0, 1.0), "it gets all again"
+    assert demands.given_ratio("merge", told(9.0, used=2.0), 2 * EVERY_S) == 1.0, "it gets all again"
 
 
-def test_a_loss_that_the_machine_s_figures_explain_is_not_counted_twice() -> None:
-    demands, starved = Demands(), told(9.0, got=0.5, used=4.0)
-    for now in (0.0, EVERY_S):
-        demands.learn("merge", starved, now)
-    share, _ = demands.shortfalls.of("merge", starved)
-    assert share == pytest.approx(1.0)
+def test_how_long_jobs_are_seen_to_take_counts_on_a_full_machine_where_the_task_is() -> None:
+    """Where the load has ended the jobs that it held up count in their mean for some seconds."""
+    demands, jobs = Demands(), Jobs(time_s=0.4, cpu_s=0.1, wait_s=0.3, age_s=0.5, done_hz=2.0, wanted_hz=2.0)
+    full, calm = (profile(0.2, cpu=used, jobs=jobs) for used in (4.0, 0.3))
+    demands.learn("merge", full, 0.0)
+    assert demands.seen_s("merge", full, 0.0) == 0.0, "it has just come"
+    assert demands.seen_s("merge", full, EVERY_S) == 0.5
+    assert demands.seen_s("merge", profile(0.2, cpu=4.0, jobs=replace(jobs, age_s=None)), EVERY_S) == 0.4
+    assert demands.seen_s("merge", calm, EVERY_S) == 0.0
+    assert demands.seen_s("merge", replace(full, node="edge2"), EVERY_S) == 0.0
+    assert demands.seen_s("merge", profile(0.2, cpu=4.0), EVERY_S) == 0.0
 
 
 def test_the_same_word_again_is_no_news() -> None:
@@ -397,17 +395,6 @@ def test_the_same_word_again_is_no_news() -> None:
     news = [demands.learn("merge", word, 10.0 * at) for at, word in enumerate([told(9.0)] * 3)]
     assert news == [True, False, False]
     assert demands.learn("merge", told(9.0, cpu_s=0.3), 30.0)
-
-
-def test_a_worker_that_tells_its_jobs_no_more_is_known_by_what_it_told() -> None:
-    """A restart with an older kit, for one."""
-    demands, pinned = Demands(), told(9.0, got=0.5, used=2.0)
-    for number in range(2):
-        demands.learn("merge", pinned, number * EVERY_S)
-    seen, job = demands.shortfalls.of("merge", pinned), demands.job("merge")
-    demands.learn("merge", profile(0.5, cpu=2.0), 2 * EVERY_S)
-    assert demands.shortfalls.of("merge", pinned) == seen != (1.0, 1.0)
-    assert demands.job("merge") == job is not None
 
 
 @pytest.mark.parametrize("is_moved", [True, False])
@@ -436,33 +423,25 @@ def test_the_job_of_a_worker_that_was_replaced_bounds_no_worker_that_tells_none(
 
 @pytest.mark.parametrize("is_moved", [True, False])
 @pytest.mark.parametrize("is_changed", [True, False])
-def test_a_changed_program_is_not_held_to_what_the_one_before_needed_and_lacked(
-    *, is_moved: bool, is_changed: bool
-) -> None:
+def test_a_changed_program_is_not_held_to_what_the_one_before_needed(*, is_moved: bool, is_changed: bool) -> None:
     """On a machine without free CPU its use alone would never lower the need.
 
     A recipe that changes otherwise starts the same program again.
     """
     fleet = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))
-    heavy, pinned = profile(2.0, 600.0, cpu=3.0), told(9.0, got=0.5, used=2.0)
+    before = profile(2.0, 600.0, cpu=3.0)
     light = profile(0.5, 200.0, node="edge2" if is_moved else "edge1", cpu=4.0, wanted=3.0)
-    found = []
-    for before in (heavy, pinned):
-        gateway = Gateway(fleet)
-        due = replace(before, workers=tuple(replace(load, renewal=Renewal.DUE) for load in before.workers))
-        starting = replace(before, workers=(load_of(state=WorkerState.STARTING),))
-        for number, one in enumerate((before, before, due, due, starting, light)):
-            assert gateway.absorb(replace(one, sequence=number), number * EVERY_S) is None
-            gateway.learn_demand("merge", one.node, number * EVERY_S)
-            if number == 0 and is_changed:
-                gateway.expect_another("merge")
-            if number == 3:
-                found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.shortfalls.of("merge", before)))
-        found.append((gateway.demand(TASK, before).cpu_cores, gateway.demands.shortfalls.of("merge", before)))
-    needs, lacks = [need for need, _ in found], [lack for _, lack in found]
-    assert needs[:2] == [2.0, UNSURE * 0.5 if is_changed else 2.0]
-    assert lacks[2] != (1.0, 1.0), "what runs until then is the one before"
-    assert lacks[3] == ((1.0, 1.0) if is_changed else lacks[2])
+    gateway = Gateway(fleet)
+    due = replace(before, workers=tuple(replace(load, renewal=Renewal.DUE) for load in before.workers))
+    starting = replace(before, workers=(load_of(state=WorkerState.STARTING),))
+    for number, one in enumerate((before, before, due, due, starting, light)):
+        assert gateway.absorb(replace(one, sequence=number), number * EVERY_S) is None
+        gateway.learn_demand("merge", one.node, number * EVERY_S)
+        if number == 0 and is_changed:
+            gateway.expect_another("merge")
+        if number == 3:
+            assert gateway.demand(TASK, before).cpu_cores == 2.0, "what runs until then is the one before"
+    assert gateway.demand(TASK, before).cpu_cores == (UNSURE * 0.5 if is_changed else 2.0)
 
 
 def test_a_job_without_cpu_time_bounds_nothing() -> None:
@@ -475,21 +454,6 @@ def test_a_job_without_cpu_time_bounds_nothing() -> None:
         job = demands.job("merge")
         assert job is not None
         assert job.most_cores(1.0, 0.5) is None
-
-
-def test_a_worker_that_does_not_tell_its_jobs_ages_is_judged_by_how_long_they_take() -> None:
-    """Class latest: what waits gives way, so that a job is as old as it takes."""
-    pinned = told(9.0, got=0.5, used=2.0)
-    load = pinned.workers[0]
-    assert load.jobs is not None
-    young = replace(pinned, workers=(replace(load, jobs=replace(load.jobs, age_s=None)),))
-    old = replace(pinned, workers=(replace(load, jobs=replace(load.jobs, age_s=3.0 * load.jobs.time_s)),))
-    for word, stretch in ((young, 2.0), (old, 6.0)):
-        demands = Demands()
-        demands.learn("merge", told(9.0), 0.0)
-        demands.learn("merge", word, EVERY_S)
-        demands.learn("merge", word, 2 * EVERY_S)
-        assert demands.shortfalls.of("merge", pinned)[1] == pytest.approx(stretch)
 
 
 def test_a_job_is_at_least_as_old_as_it_takes() -> None:
@@ -510,30 +474,6 @@ def test_a_job_of_several_threads_takes_elsewhere_what_it_takes_here() -> None:
     assert job.most_cores(1.0, 2.0) is None, "it may use any number of cores"
 
 
-def test_jobs_that_take_longer_than_foreseen_are_remembered_though_all_of_them_are_done() -> None:
-    demands, slow = Demands(), told(2.0, got=2 / 3, used=1.0)
-    for now in (0.0, EVERY_S):
-        demands.learn("merge", slow, now)
-    assert demands.shortfalls.of("merge", slow) == pytest.approx((1.0, 1.5))
-
-
-def test_jobs_that_a_load_held_up_tell_nothing_of_the_machine_when_it_has_ended() -> None:
-    """Their mean age follows within seconds, the machine's figures at once."""
-    demands, lag_s, calm_s, held_up_s = Demands(), 1.5, 0.1, 0.4
-    for step in range(60):
-        now, ended_for_s = 0.5 * step, 0.5 * (step - 20)
-        is_over = ended_for_s >= 0.0
-        age_s = calm_s + (held_up_s - calm_s) * math.exp(-ended_for_s / lag_s) if is_over else held_up_s
-        jobs = Jobs(time_s=age_s, cpu_s=0.1, wait_s=age_s - 0.1, age_s=age_s, done_hz=2.0, wanted_hz=2.0)
-        one = profile(0.2, cpu=0.3 if is_over else 4.0, jobs=jobs)
-        demands.learn("merge", one, now, fair_cores=4.0 if is_over else 0.25)
-        assert demands.shortfalls.of("merge", one) == (1.0, 1.0)
-    jobs = Jobs(time_s=0.3, cpu_s=0.1, wait_s=0.2, age_s=0.3, done_hz=2.0, wanted_hz=2.0)
-    slow = profile(0.2, cpu=0.3, jobs=jobs)
-    demands.learn("merge", slow, 30.0, fair_cores=4.0)
-    assert demands.shortfalls.of("merge", slow)[1] == pytest.approx(3.0, rel=0.1), "which nothing explains"
-
-
 @pytest.mark.parametrize(
     "jobs",
     [
@@ -547,4 +487,4 @@ def test_who_needed_more_before_and_does_not_say_that_it_lacks_a_cpu_gets_its_sh
     for number, word in enumerate((before, before, now_on_full, now_on_full)):
         demands.learn("merge", word, number * EVERY_S)
     assert demands.at(TASK, now_on_full).cpu_cores == 0.6
-    assert demands.shortfalls.of("merge", now_on_full)[0] == 1.0
+    assert demands.given_ratio("merge", now_on_full, 3 * EVERY_S) == 1.0

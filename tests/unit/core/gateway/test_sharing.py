@@ -99,89 +99,12 @@ def share_of(shares: Shares, runnable: float, node: str = "edge1") -> float:
     return shares.at("merge", idle(node, runnable=runnable), 4.0)
 
 
-def test_others_that_waited_only_beside_the_task_wait_again_when_it_comes_back() -> None:
-    shares, now = Shares(), 100.0
-    crowded(shares)
-    assert shares.left_by("merge", "edge2") == ("edge1",)
-    assert shares.left_by("merge", "edge1") == shares.left_by("slam", "edge2") == ()
-    for runnable in (4.0, 3.0):  # the means follow
-        shares.look_back("merge", idle(runnable=runnable), now)
-        assert share_of(shares, runnable) == pytest.approx(fair_share(4.0, 4.0, 5.0))
-        now += 1.0
-    assert not shares.look_back("merge", idle(runnable=3.0), now), "the same again is no news"
-    assert share_of(shares, 3.0, "edge2") == pytest.approx(fair_share(4.0, 4.0, 3.0))
-    now += LEFT_S
-    assert not shares.look_back("merge", idle(runnable=0.0), now), "what changes later is the others' doing"
-    assert share_of(shares, 0.0) == pytest.approx(fair_share(4.0, 4.0, 2.0))
-
-
-def test_another_task_that_comes_just_after_it_has_left_hides_nothing() -> None:
-    shares = Shares()
-    crowded(shares)
-    shares.look_back("merge", idle(runnable=3.0), 100.0)
-    assert not shares.look_back("merge", idle(runnable=7.0), 102.0)
-    assert share_of(shares, 3.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
-
-
-@pytest.mark.parametrize("runnable", [4.0, 9.0])
-def test_no_more_others_are_expected_than_were_found_or_are_there(runnable: float) -> None:
-    """Somebody else makes those threads wait by now."""
-    shares = Shares()
-    crowded(shares)
-    shares.look_back("merge", idle(runnable=1.0), 100.0)
-    assert share_of(shares, runnable) == pytest.approx(fair_share(4.0, 4.0, max(runnable, 5.0)))
-
-
-def test_so_do_others_that_waited_beside_a_task_that_lacked_nothing() -> None:
-    """It took all that was left, and they a little less than they want."""
-    shares = Shares()
-    assert not shares.learn("merge", profile(runnable=3.0, got=2.0), 99.0)
-    shares.look_back("merge", idle(runnable=0.6), 100.0)
-    assert share_of(shares, 0.6) == pytest.approx(fair_share(4.0, 4.0, 1.0))
-
-
-def test_a_worker_that_goes_on_for_long_has_not_left() -> None:
-    """Until the next owner's is ready, for one."""
-    shares, at_work = Shares(), load_of(cpu_cores=1.6, runnable=4.0)
-    crowded(shares)
-    for now in range(100, 160):
-        assert not shares.look_back("merge", of(at_work, 9.0), float(now))
-    shares.look_back("merge", idle(runnable=3.0), 160.0)
-    assert share_of(shares, 3.0) == pytest.approx(fair_share(4.0, 4.0, 5.0))
-
-
-def test_where_the_task_is_again_others_are_those_that_are_seen() -> None:
-    shares = Shares()
-    crowded(shares)
-    assert shares.look_back("merge", idle(runnable=3.0), 100.0)
-    there = profile(runnable=5.0, got=2.0)  # it lacks nothing now: nothing is learnt
-    assert not shares.learn("merge", there, 200.0)
-    assert shares.at("merge", there, 2.0) == pytest.approx(fair_share(4.0, 4.0, 3.0))
-
-
 def test_others_that_ended_while_the_task_stayed_are_expected_no_more() -> None:
     shares = Shares()
     crowded(shares)
     assert not shares.learn("merge", profile(runnable=2.5, got=2.0), 150.0)
     shares.look_back("merge", idle(runnable=0.1), 151.0)
     assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0)), "half a thread was there at last"
-
-
-def test_a_load_that_ends_just_after_the_task_has_left_is_no_thread_that_rests() -> None:
-    """Threads that rest use as much without the task, or more."""
-    shares = Shares()
-    crowded(shares)
-    shares.look_back("merge", idle(runnable=5.0), 100.0)
-    ended = profile_of("edge1", cpu_used_cores=0.2, workers=(load_of(cpu_cores=0.0),), runnable=0.2)
-    assert shares.look_back("merge", ended, 102.0)
-    assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0))
-
-
-def test_a_machine_that_was_away_tells_nothing_of_what_was_there_before() -> None:
-    shares = Shares()
-    crowded(shares)
-    assert shares.look_back("merge", idle(runnable=0.0), 100.0 + LEFT_S)
-    assert share_of(shares, 4.0) == pytest.approx(fair_share(4.0, 4.0, 4.0))
 
 
 def weighed_down(shares: Shares) -> None:
@@ -206,7 +129,7 @@ def test_what_a_task_got_beside_a_crowd_that_has_ended_says_nothing_of_the_next_
     assert not shares.look_back("merge", used(2.0), 162.0 + 2 * ENDED_S)
     assert shares.look_back("merge", used(2.0), 162.1 + 2 * ENDED_S)
     assert share_of(shares, 4.0) == pytest.approx(fair)
-    assert "edge1" in shares.left_by("merge", "edge2"), "its others are still known"
+    assert shares.left_by("merge", "edge2") == ()
 
 
 def test_a_machine_of_another_size_is_another_one() -> None:

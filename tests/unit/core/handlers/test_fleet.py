@@ -26,7 +26,7 @@ from zsched.core.values.fleet import Fleet, StreamRule, WorkerSpec
 from zsched.core.values.messages import Learnt, Prepare
 from zsched.core.values.model import NodeKind
 from zsched.core.values.plan import Direction, StreamCount
-from zsched.core.values.profile import Jobs, Renewal, WorkerState
+from zsched.core.values.profile import Renewal, WorkerState
 from zsched.core.values.words import CREATION_STEP
 
 START = 100.0
@@ -346,33 +346,23 @@ def test_a_changed_worker_needs_what_its_owner_s_one_does_and_nothing_where_ther
     assert node.gateway.demands.is_replaced("merge", large), "the next one that is ready is the changed one"
 
 
-def test_a_heavier_program_that_was_tried_on_one_node_makes_no_slow_machine_of_it() -> None:
-    """What a machine was slower by is void when the others run that program, too (decision 0118)."""
+def test_what_the_program_before_needed_is_void_once_the_others_run_the_one_that_was_tried() -> None:
     old = task_of(candidates=("edge1", "edge2"), worker=WorkerSpec(command=("old",)))
     promoted = replace(old, worker=WorkerSpec(command=("new",)))
     tried = replace(promoted, rollout=Rollout(task="merge", first=("edge2",), command=(Text("old"),)))
     node = node_of(fleet_of(old))
+    shown = profile_of("edge1", cpu_used_cores=0.3, speed=1.0, workers=(load_of(cpu_cores=0.3),))
 
-    def work(owner: str, cpu_s: float, since: float) -> None:
-        """Ten jobs a second for some time."""
-        jobs = Jobs(time_s=cpu_s, cpu_s=cpu_s, wait_s=0.0, age_s=cpu_s, done_hz=10.0, wanted_hz=10.0)
-        load = load_of(cpu_cores=10 * cpu_s, jobs=jobs)
-        shown = profile_of(owner, cpu_used_cores=10 * cpu_s, speed=1.0, workers=(load,))
-        for second in range(20):
-            node.gateway.demands.learn("merge", shown, since + second)
+    def need() -> float:
+        return node.gateway.demand(old, shown).cpu_cores
 
-    def speed(name: str) -> float:
-        return node.gateway.demands.speed("merge", profile_of(name, speed=1.0))
-
-    work("edge1", 0.03, START)
+    adopt(node, fleet_of(tried), START)
+    for second in range(20):
+        node.gateway.demands.learn("merge", shown, START + second)
     adopt(node, fleet_of(tried), START + 20)
-    work("edge1", 0.03, START + 20)
-    work("edge2", 0.075, START + 40)
-    assert speed("edge2") == pytest.approx(0.4), "as far as anybody can see"
-    adopt(node, fleet_of(tried), START + 60)
-    assert speed("edge2") == pytest.approx(0.4), "nothing has changed"
-    adopt(node, fleet_of(promoted), START + 60)
-    assert speed("edge2") == 1.0
+    assert need() == pytest.approx(0.3), "nothing has changed"
+    adopt(node, fleet_of(promoted), START + 20)
+    assert need() == old.demand.cpu_cores
 
 
 def test_a_task_that_comes_back_has_the_first_owner_that_it_had() -> None:

@@ -68,20 +68,6 @@ def test_a_task_that_came_to_a_machine_whose_cpu_is_not_measured_shows_there_aft
     assert gateway.demands.unshown_ratio("plan", "edge2", now) == pytest.approx(0.0, abs=0.01)
 
 
-def test_a_need_is_as_old_as_its_last_measurement_though_the_task_was_seen_without_one_since() -> None:
-    """Ten minutes later it may have grown: a machine would have been taken for slow by a need of then."""
-    names = ("edge1", "edge2", "edge3", "robot1")
-    plan = replace(PLAN, candidates=names[:3])
-    gateway, step, now = Gateway(fleet_of(plan, of=names, electors=("robot1",))), 0, 10.0
-    for owner, cpu, used, seconds in (("edge1", 1.0, 0.5, 20), ("edge2", None, None, 600), ("edge3", 4.0, 2.0, 20)):
-        for _ in range(2 * seconds):
-            step, now = step + 1, now + 0.5
-            held = profile_of(owner, sequence=step, cpu_used_cores=cpu, workers=(load("plan", cpu=used),))
-            assert gateway.absorb(held, now) is None
-            gateway.learn_demand("plan", owner, now)
-    assert gateway.demands.speed("plan", held) == 1.0
-
-
 @pytest.mark.parametrize(
     ("shown", "cpu", "memory"),
     [

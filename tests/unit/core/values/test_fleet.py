@@ -48,7 +48,7 @@ FLEET = Fleet(
 
 
 def test_defaults_are_the_design_s_first_ones() -> None:
-    assert (TUNING.bonus, TASK.price_s, TASK.memory_s) == (0.10, 0.3, 200.0)
+    assert (TUNING.bonus, TASK.price_s, TASK.memory_s) == (0.10, 0.3, 1000.0)
     assert TUNING.aggregate is Aggregate.MEAN
     assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
     timing = Timing()

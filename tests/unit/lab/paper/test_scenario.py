@@ -150,7 +150,7 @@ def test_every_scheme_makes_a_valid_fleet_file(tmp_path: Path, scenario: Scenari
     family = SCHEMES[name].family
     if family is Family.OURS:
         tuned = (spec.price_s, spec.memory_s, spec.tuning.bonus)
-        assert tuned == (0.3, 200.0, DEFAULT_BONUS), "the product as it comes"
+        assert tuned == (0.3, 1000.0, DEFAULT_BONUS), "the product as it comes"
         assert spec.tuning.score is ScoreForm.SERVICE
     elif family is not Family.FIXED:
         assert spec.price_s == 0.0

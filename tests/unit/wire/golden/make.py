@@ -74,7 +74,7 @@ _DECISION = decision.Decision(
             memory_floor_ratio=0.05,
             max_moves_per_minute=6,
             price_s=0.3,
-            memory_s=200.0,
+            memory_s=1000.0,
             start_deadline_s=20.0,
             has_command=True,
         ),

@@ -1,0 +1,89 @@
+"""SCHEDULER: what machines have kept of what they promised a task.
+
+Knows: what a machine was worth just before the task came, and what it was worth with the task. Does not know: why the
+two differ, what a move costs (`zsched.core.scheduler.ledger`).
+
+A machine that looks better than it is (slower for this task than the benchmark says, a quota, memory that nobody shows)
+would be left as soon as it has shown that, and be chosen again as soon as the task is away, without end. So what it
+gave counts for as long as it promises the same: then the cause is there as well, whatever it is. A cause that ends
+unseen is found by trying again: what was kept fades.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping
+from typing import Final, Self
+
+from zsched.core.gateway.demand import SETTLE_S
+from zsched.core.values.decision import KeptMemory
+from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct, field
+
+SAME_WORTH: Final = 0.1
+"""A promise is the same as long as it differs by at most this."""
+
+
+class Kept(Struct):
+    """What one robot has seen machines give one task."""
+
+    owner: NodeId | None = None
+    since: float = 0.0
+    """When this owner was first seen."""
+    foretold: dict[NodeId, float] = field(default_factory=dict)
+    """{machine: its worth when it was last judged without the task}."""
+    seen: dict[NodeId, tuple[float, float, float]] = field(default_factory=dict)
+    """{machine: (what it promised, what it gave, when)}."""
+
+    @classmethod
+    def of(cls, memory: KeptMemory) -> Self:
+        """What a memory says."""
+        seen = {name: (promised, gave, at) for name, promised, gave, at in memory.seen}
+        return cls(owner=memory.owner, since=memory.since, foretold=dict(memory.foretold), seen=seen)
+
+    def memory(self) -> KeptMemory:
+        """All of it, as a value."""
+        return KeptMemory(
+            owner=self.owner,
+            since=self.since,
+            foretold=tuple(sorted(self.foretold.items())),
+            seen=tuple((name, *one) for name, one in sorted(self.seen.items())),
+        )
+
+    def keep(self, nodes: Container[NodeId]) -> None:
+        """Know nothing of other nodes: one of the same name that comes later is another one."""
+        self.foretold = {name: one for name, one in self.foretold.items() if name in nodes}
+        self.seen = {name: one for name, one in self.seen.items() if name in nodes}
+
+    def look(self, worth: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
+        """Note what each machine is worth now, and what ``owner`` gives.
+
+        While the task's use still rises the newest figure counts, then the best one: a load that comes is not the
+        machine's doing.
+
+        >>> kept = Kept()
+        >>> kept.look({"edge1": 0.6, "edge2": 0.9}, "edge1", now=0.0)
+        >>> kept.look({"edge1": 0.6, "edge2": 0.5}, "edge2", now=5.0)
+        >>> kept.corrected({"edge1": 0.6, "edge2": 0.9}, "edge1", 200.0, now=5.0)
+        {'edge1': 0.6, 'edge2': 0.5}
+        """
+        if owner != self.owner:
+            self.owner, self.since = owner, now
+            if owner is not None:
+                self.seen.pop(owner, None)
+        if owner is not None and owner in worth and owner in self.foretold:
+            gave, before = worth[owner], self.seen.get(owner)
+            if before is not None and now - self.since >= SETTLE_S:
+                gave = max(gave, before[1])
+            self.seen[owner] = (self.foretold[owner], gave, now)
+        self.foretold |= {name: value for name, value in worth.items() if name != owner}
+
+    def corrected(
+        self, worth: Mapping[NodeId, float], owner: NodeId | None, memory_s: float, now: float
+    ) -> dict[NodeId, float]:
+        """What each machine is worth by what it has kept; half of that is forgotten in ``memory_s``."""
+        found = dict(worth)
+        for name, (promised, gave, at) in self.seen.items():
+            value = found.get(name, 0.0)
+            if name != owner and gave < value <= promised + SAME_WORTH and value >= promised - SAME_WORTH:
+                found[name] = value - (value - gave) * 0.5 ** ((now - at) / memory_s)
+        return found
