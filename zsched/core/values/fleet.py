@@ -268,7 +268,7 @@ class TaskSpec:
     )
     max_moves_per_minute: int = 6
     """A fuse, whatever the figures say; no file sets it."""
-    memory_s: float = key(1000.0, "Half of what a machine has lost, or not kept, is forgotten in this time.", Range(1, 86400, "s"))
+    memory_s: float = key(1000.0, "Half of what is held against a machine is forgotten in it.", Range(1, 86400, "s"))
     on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
     exclusive: bool = key(
         False,

@@ -74,4 +74,4 @@ def test_it_is_a_value_and_nothing_is_known_of_a_node_that_is_no_more() -> None:
     kept = gave((1.5, 0.5))
     assert Kept.of(kept.memory()) == kept
     kept.keep(("edge1",))
-    assert (kept.seen.keys(), kept.foretold.keys()) == ({"edge1"}, {"edge1"})
+    assert ({*kept.seen}, {*kept.foretold}) == ({"edge1"}, {"edge1"})
