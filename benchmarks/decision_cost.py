@@ -119,7 +119,7 @@ def measure(candidates: int, robots: int, repeat: int, tuning: Tuning) -> tuple[
     standing = compare(task, allocation, vectors)
 
     def judge() -> None:
-        Judge(spec=task).judge(standing, allocation, escape=None, is_called=False, now=one.now, damping=None)
+        Judge(spec=task).judge(standing, allocation, escape=None, is_called=False, now=one.now, fuse=None)
 
     return (
         milliseconds(one.own, repeat),

@@ -47,7 +47,7 @@ CUT_S = 20.0
 RECOVERY_S = 3.0
 """After a cut, TCP's own timers hold a link's streams back for up to so long; the next fault waits for it."""
 CYCLE_S = 1.2
-"""No more than 50 faults a minute: escapes are bounded at 60 (`zsched.core.scheduler.damping`), not measured here."""
+"""No more than 50 faults a minute: escapes are bounded at 60 (`zsched.core.scheduler.fuse`), not measured here."""
 CASES = ("killed", "worker", "frozen", "cut", "heal")
 MAX_FAILURES = 5
 CALM_S = 90.0

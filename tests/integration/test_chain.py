@@ -121,7 +121,7 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     owner = bed.wait_settled()
     pinger = ping("robot1")
     bed.wait(lambda: pinger.has_newer_than(5), 60, "first echoes")
-    held = bed.wait(partial(_next_decision, bed, owner), 60, "a decision")["penalties"].get(owner, 0.0)
+    held = bed.wait(partial(_next_decision, bed, owner), 60, "a decision")["unkept"].get(owner, 0.0)
     ((code, seconds),) = bed.stop(owner).values()
     assert code == 0
     within(seconds, STOP_S)
@@ -132,7 +132,7 @@ def test_stopping_owner_hands_its_task_over_first(bed: Testbed, ping: Callable[[
     history = bed.task("robot1")["history"]
     assert (history[-1]["owner"], history[-1]["epoch"]) == (moved, history[-2]["epoch"] + 1)
     decision = bed.wait(partial(_next_decision, bed, moved), 60, "a decision about the new owner")
-    assert decision["penalties"].get(owner, 0.0) <= held, "it was told to stop: that is no failure"
+    assert decision["unkept"].get(owner, 0.0) <= held, "it was told to stop: that is no failure"
 
 
 def test_an_owner_that_nobody_relieves_says_what_it_leaves_behind(bed: Testbed) -> None:

@@ -377,7 +377,7 @@ def test_a_move_is_explained_remembered_and_judged_again(tmp_path: Path) -> None
         assert (body["schema"], body["node"]) == ("zsched.explain/1", "robot1")
         for one in body["candidates"]:
             if one["total"] is not None:
-                assert one["total"] == max(one["joint"] + one["bonus"] - one["penalty"], 0.0)
+                assert one["total"] == one["joint"] - one["unkept"] + one["bonus"]
         plan = robot.zsched("explain", "echo", "--plan", f"{owner}=down")
         assert plan.returncode == 10, plan.stderr
         assert f"{owner} is gone" in plan.stdout

@@ -150,7 +150,7 @@ def test_where_every_candidate_rests_the_task_is_tried_elsewhere_ever_more_seldo
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("is_busy", "down_s", "most_moves"), [(False, 5.0, 1), (True, 1.6, 12), (True, 5.0, 20)])
+@pytest.mark.parametrize(("is_busy", "down_s", "most_moves"), [(False, 5.0, 1), (True, 1.6, 20), (True, 5.0, 20)])
 def test_a_link_that_is_down_now_and_then_costs_the_task_little(is_busy: bool, down_s: float, most_moves: int) -> None:
     """Without a word about electors it stood still for a quarter of the time where the link is down that long."""
     played = play(down_s, is_busy=is_busy, for_s=200.0)

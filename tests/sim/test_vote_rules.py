@@ -100,26 +100,3 @@ def scores(sim: Simulator, edge: str) -> list[float]:
     """What each robot makes of an edge: the joint utility, less what is held against it."""
     judgements = [sim.node(voter).rounds.tasks["merge"].judgement for voter in VOTERS]
     return [-1.0 if judgement is None else judgement.aggregates.get(edge, -1.0) for judgement in judgements]
-
-
-def test_a_robot_that_has_forgotten_or_missed_a_failure_judges_as_the_others_do() -> None:
-    """robot1 is restarted after the owner failed, robot2 was cut off meanwhile; nobody may vote for a dead past."""
-    sim = reaching_all(3)
-    owner = sim.agreed("merge")
-    assert owner is not None
-    rest = tuple(name for name in sim.running() if name != "robot2")
-    sim.cut(("robot2",), rest)
-    sim.crash(owner)
-    assert sim.run_until(lambda: sim.agreed("merge", "robot1", "robot3") not in (None, owner), 30), sim.stories[-20:]
-    sim.crash("robot1")
-    sim.heal()
-    sim.start("robot1")
-    sim.start(owner)
-    assert sim.run_until(lambda: min(scores(sim, owner)) > 0.0, 20), scores(sim, owner)
-    sim.run(2.0)
-    for voter in VOTERS:  # at rest a robot judges by the others' last answers, which are up to a profile's life old
-        sim.node(voter).rounds.hurry(sim.now)
-    sim.run(0.7)
-    held = [sim.node(voter).rounds.tasks["merge"].damping.penalty(owner, sim.now) for voter in VOTERS]
-    assert held[0] < held[2] - 0.1  # what each remembers differs ...
-    assert max(scores(sim, owner)) - min(scores(sim, owner)) < 1 / 256  # ... and what each makes of it does not

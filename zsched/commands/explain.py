@@ -447,7 +447,6 @@ def _sum(page: Page, body: Json, one: Json, indent: int) -> None:
         text = f"{body['tuning']['aggregate']} {one['joint']:.4f}"
         text += f" - not kept {one['unkept']:.4f}" if one.get("unkept") else ""
         text += f" + bonus {one['bonus']:g}" if one["bonus"] else ""
-        text += f" - penalty {one['penalty']:g}" if one["penalty"] else ""
     if one["total"] is not None:
         text += f" = {one['total']:.4f}"
     if one.get("owed_s") is not None:

@@ -469,8 +469,8 @@ def _candidate_cells(name: str, room: int, task: Json, decision: Json, voters: S
     best = max(decision["aggregates"].values(), default=None)
     style = "red" if veto else "bold" if joint is not None and joint == best else ""
     notes = [f"owner +{task['tuning']['bonus']:g}"] if name == task["owner"] else []
-    penalty = decision.get("penalties", {}).get(name)  # a later field of the schema's major version
-    notes += [f"penalty -{penalty:.2g}"] if penalty else []
+    unkept = decision.get("unkept", {}).get(name)  # a later field of the schema's major version
+    notes += [f"not kept -{unkept:.2g}"] if unkept else []
     return [
         (short_name(name, room), style),
         (_number(joint, 3), style),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE
+from zsched.core.scheduler.fuse import ESCAPES_PER_MINUTE
 from zsched.core.scheduler.ledger import AHEAD_S, left_after_s
 from zsched.core.scheduler.scoring import REACH_MARGIN_DB
 from zsched.core.scheduler.utility import NEARLY_FULL

@@ -18,7 +18,6 @@ from zsched.core.scheduler.eligibility import is_of_machine, may_get
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import score
-from zsched.core.scheduler.standing import joined
 from zsched.core.stages import UNREADY_SHOWN_S, Stages, Unready
 from zsched.core.values.deadline import tells_jobs
 from zsched.core.values.decision import Explanation
@@ -722,7 +721,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
         aggregates=tuple(sorted(judgement.aggregates.items())),
         utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
         vetoed=tuple(sorted(joint.vetoed.items())),
-        penalties=tuple(joined((standing.damping.penalties(now), joint.penalties)).items()),
+        unkept=tuple(sorted(standing.judge.kept.unkept(joint.aggregates, standing.judge.spec.memory_s, now).items())),
         silent=standing.silent,
     )
 

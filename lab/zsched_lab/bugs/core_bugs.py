@@ -50,7 +50,6 @@ MEMBERSHIP, NODE = "zsched.core.membership.peers", "zsched.core.node"
 VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
 DECISION, ROUNDS = "zsched.core.scheduler.decision", "zsched.core.scheduler.rounds"
 ORDERS, EXPIRY = "zsched.core.handlers.orders", "zsched.core.vote.expiry"
-DAMPING = "zsched.core.scheduler.damping"
 SCHEDULER, SCORING, USAGE, STANDING, EXECUTOR = (
     "zsched.core.scheduler.judge",
     "zsched.core.scheduler.scoring",
@@ -897,7 +896,7 @@ VOTE_BUGS = (
         SCHEDULER,
         "return None if done < limit else f",
         "return None if done < 10 * limit else f",
-        ("tests/unit/core/scheduler/test_damping.py",),
+        ("tests/unit/core/scheduler/test_fuse.py",),
     ),
     _bug(
         "bonus twice",
@@ -940,13 +939,6 @@ VOTE_BUGS = (
         "    node.probation.on_token(event.node",
         "    _ = event.task in node.executors and node.probation.on_token(event.node",
         ("tests/unit/core/test_status.py",),
-    ),
-    _bug(
-        "what other robots hold against a node is not heard",
-        SCHEDULER,
-        "joined((damping.penalties(now), standing.penalties))",
-        "joined((damping.penalties(now),))",
-        (*_SCHEDULER, "tests/sim/test_vote_rules.py"),
     ),
     _bug(
         "a worker that has nothing more to do lacks what it lacked before",
@@ -1073,13 +1065,6 @@ VOTE_BUGS = (
         " and not (is_unheard and winner != allocation.home)",
         "",
         _SCHEDULER,
-    ),
-    _bug(
-        "one robot's penalty shuts a machine out",
-        "zsched.core.scheduler.standing",
-        "max(min(penalty, MAX_PENALTY), most",
-        "max(penalty, most",
-        ("tests/unit/core/scheduler/test_compare.py",),
     ),
     _bug(
         "a vote that others have won takes no room",
@@ -1547,10 +1532,10 @@ ORDER_BUGS = (
         _ORDERS,
     ),
     _bug(
-        "an ordered move counts in damping",
-        DAMPING,
-        "if left is not None and not is_ordered:",
-        "if left is not None:",
+        "an ordered move counts in the fuse",
+        "zsched.core.scheduler.rounds",
+        "if left is None or is_ordered:",
+        "if left is None:",
         _ORDERS,
     ),
     _bug(

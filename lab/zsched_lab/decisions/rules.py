@@ -2,8 +2,8 @@
 
 Knows: when each rule looks, and which node it then chooses. Does not know: the truth, what a choice is worth.
 
-`CoreRule` is the production's decision: `zsched.core.scheduler.decision` at each robot, a called vote, the tally, flap
-damping. It does what `zsched.core.scheduler.rounds` does when no message is lost;
+`CoreRule` is the production's decision: `zsched.core.scheduler.decision` at each robot, a called vote, the tally, the
+bound on moves. It does what `zsched.core.scheduler.rounds` does when no message is lost;
 `tests/unit/lab/decisions/test_same_as_nodes.py` holds the two together.
 """
 
@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Protocol
 
-from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide_by, rules_of
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.standing import Standing, pick
 from zsched.core.values.decision import Figures, Rules
@@ -60,7 +60,7 @@ class CoreRule:
     moves: list[Move] = field(default_factory=list)
     _judges: list[Judge] = field(init=False)
     _allocation: Allocation = field(init=False)
-    _damping: Damping = field(default_factory=Damping)
+    _fuse: Fuse = field(default_factory=Fuse)
     _settled_at: float = -math.inf
     _spec: TaskSpec = field(init=False)
     _rules: Rules = field(init=False)
@@ -101,7 +101,7 @@ class CoreRule:
             owner_profile=None if owner is None else self.view.gateway.fresh(owner, now),
             is_called=is_called,
         )
-        return decide_by(standing, self._judges[seat], self._damping, figures).judgement
+        return decide_by(standing, self._judges[seat], self._fuse, figures).judgement
 
     def _vote(self, caller: int, first: Judgement, standing: Standing, at_s: float, now: float) -> None:
         """Every robot answers the caller with today's winner; the tally decides (Alg. 3)."""
@@ -128,7 +128,8 @@ class CoreRule:
             judge.reset(is_new_owner=won)
         if counted.winner is None or not won:
             return
-        self._damping.note_move(owner, has_failed=False, is_escape=counted.is_escape, now=now)
+        if owner is not None:
+            self._fuse.note_move(is_escape=counted.is_escape, now=now)
         self._settled_at = now + COMMIT_S
         self._allocation = Allocation(
             task=self._spec.name, revision=0, epoch=self._allocation.epoch + 1, owner=counted.winner, tuning=self.tuning

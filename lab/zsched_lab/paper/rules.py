@@ -30,7 +30,7 @@ CERTAIN = 1.0
 class RuleName(StrEnum):
     """The rules."""
 
-    UNDAMPED = "undamped"  # the product's rule without flap damping and without the cap of moves
+    UNDAMPED = "undamped"  # the product's rule without the cap of moves
     PENALTY = "penalty"  # the literal reading of the paper: its cost lowers the owner
     RANDOM = "random"
     FIRST = "first"
@@ -146,7 +146,7 @@ class RuledJudge(Judge):
         aggregates = self.rule.apply(
             standing.aggregates, allocation.owner, given["now"], is_called=bool(given["is_called"])
         )
-        return super().judge(replace(standing, aggregates=aggregates), allocation, **{**given, "damping": None})
+        return super().judge(replace(standing, aggregates=aggregates), allocation, **{**given, "fuse": None})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,9 +13,9 @@ from itertools import pairwise
 
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
-from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.flags import HANDS_OVER
+from zsched.core.scheduler.fuse import ESCAPES_PER_MINUTE, WINDOW_S
 from zsched.core.values.decision import Decision
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
@@ -258,7 +258,7 @@ class Invariants:
             for old, new in pairwise(node.history[proposal.task])
             if not any(told in new.reason for told in DRAINED)
         )
-        planned = moves - task.damping.moves_within(WINDOW_S, task.judged_at, escapes=True)
+        planned = moves - task.fuse.moves_within(WINDOW_S, task.judged_at, escapes=True)
         if planned >= task.spec.max_moves_per_minute:
             raise InvariantError(f"{machine.key} proposes move {planned + 1} of {proposal.task} within a minute")
 

@@ -25,7 +25,7 @@ from zsched.commands.explain import SCHEMA, ExplainView, explain, formula_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.utility import total_utility
-from zsched.core.values.decision import Decision, Explanation, Move, Need
+from zsched.core.values.decision import Decision, Explanation, JudgeMemory, KeptMemory, Move, Need
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
@@ -45,15 +45,13 @@ def decision() -> Decision:
     )
     refused = (("edge3", "worker failed: no model"),)
     vectors = tuple(
-        UtilityVector(
-            voter=robot, task="merge", revision=4, utilities=column, refused=refused, penalties=(("edge2", 0.03),)
-        )
-        for robot in ROBOTS[:2]
+        UtilityVector(voter=robot, task="merge", revision=4, utilities=column, refused=refused) for robot in ROBOTS[:2]
     )
     spec = task_of(
         candidates=("edge1", "edge2", "edge3"), price_s=0.15, tuning=TUNING, worker=WorkerSpec(command=("merge",))
     )
-    figures = figures_of(spec, *ROBOTS, vectors=vectors)
+    kept = KeptMemory(owner="edge1", seen=(("edge2", 0.45, 0.42, 1000.0),))
+    figures = figures_of(spec, *ROBOTS, vectors=vectors, judge=JudgeMemory(kept=kept))
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
 
@@ -178,7 +176,7 @@ def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
     assert asked() == 0
     text = capsys.readouterr().out
     rows = re.findall(r"^(\w*) +(robot\d) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+)$", text, re.MULTILINE)
-    sums = re.findall(r"mean ([\d.]+)(?: \+ bonus ([\d.]+))?(?: - penalty ([\d.]+))? = ([\d.]+)", text)
+    sums = re.findall(r"mean ([\d.]+)(?: - not kept ([\d.]+))?(?: \+ bonus ([\d.]+))? = ([\d.]+)", text)
     utilities: dict[str, list[float]] = {}
     name = ""
     for candidate, _, *numbers in rows:
@@ -188,10 +186,10 @@ def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
         assert utility == pytest.approx(by_formula(text, cpu=cpu, mem=memory, net=network), abs=2e-4)
         utilities.setdefault(name, []).append(utility)
     assert list(utilities) == ["edge1", "edge2"]
-    for column, (joint, bonus, penalty, total) in zip(utilities.values(), sums, strict=True):
+    for column, (joint, unkept, bonus, total) in zip(utilities.values(), sums, strict=True):
         assert float(joint) == pytest.approx(sum(column) / len(column), abs=1e-4)
-        assert float(total) == pytest.approx(float(joint) + float(bonus or 0) - float(penalty or 0), abs=2e-4)
-    assert [sum_[1:3] for sum_ in sums] == [("0.05", ""), ("", "0.03")]
+        assert float(total) == pytest.approx(float(joint) + float(bonus or 0) - float(unkept or 0), abs=2e-4)
+    assert [sum_[1:3] for sum_ in sums] == [("", "0.05"), ("0.0300", "")]
     assert "silent: robot3" in text
     assert "needs 0.40 cores 250M" in text
     assert "won edge1 · robot1 for edge1" in text
@@ -207,7 +205,7 @@ def test_json_names_its_schema_and_holds_the_same_sums(capsys: pytest.CaptureFix
     assert body["silent"] == ["robot3"]
     for one in body["candidates"]:
         if one["total"] is not None:
-            assert one["total"] == max(one["joint"] + one["bonus"] - one["penalty"], 0.0)
+            assert one["total"] == one["joint"] - one["unkept"] + one["bonus"]
     assert [one["node"] for one in body["candidates"]] == ["edge1", "edge2", "edge3"]
     assert body["plan"] is None
     assert body["vote"]["votes"] == {"robot1": "edge1"}
@@ -369,7 +367,7 @@ def test_the_judgement_that_made_an_epoch_is_told_whole_with_its_move(capsys: py
         assert (body["owner"], cpu_of_owner(body), body["made"]["epoch"]) == (owner, cpu, made)
         for one in body["candidates"]:
             if one["total"] is not None:
-                assert one["total"] == max(one["joint"] + one["bonus"] - one["penalty"], 0.0)
+                assert one["total"] == one["joint"] - one["unkept"] + one["bonus"]
     assert asked(at="5") == 0
     text = capsys.readouterr().out
     assert "judged it 1m41s ago (1970-01-01T00:33:19.000Z)" in text

@@ -190,12 +190,12 @@ def test_the_scheduler_shows_what_a_move_costs_where_the_daemon_tells_it() -> No
     assert told.replace(" · a move costs 0.2 s", "") == untold != told
 
 
-def test_bonus_and_penalty_stand_beside_the_candidate_they_change() -> None:
+def test_bonus_and_what_was_not_kept_stand_beside_the_candidate_they_change() -> None:
     status = recorded("healthy")
-    status["tasks"][0]["decision"]["penalties"] = {"edge2": 0.05, "edge1": 0.0}
+    status["tasks"][0]["decision"]["unkept"] = {"edge2": 0.05, "edge1": 0.0}
     lines = {line.split()[0]: line for line in render_status(status, 100, color=False).splitlines()[12:] if line}
     assert lines["edge1"].endswith("owner +0.1")
-    assert lines["edge2"].endswith("penalty -0.05")
+    assert lines["edge2"].endswith("not kept -0.05")
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from support.proposals import proposal_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
@@ -262,7 +262,7 @@ class Loop:
             is_called=is_called,
         )
         # without a record of moves: the cap must not hide a cycle
-        return {robot: decide(judge, Damping(), figures).judgement for robot, judge in self.judges.items()}
+        return {robot: decide(judge, Fuse(), figures).judgement for robot, judge in self.judges.items()}
 
     def _vote(self, judgements: dict[str, Judgement], now: float) -> None:
         proposals = {

@@ -19,8 +19,8 @@ from support.profiles import load_of
 from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
-from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.usage import book
@@ -223,7 +223,7 @@ class Tasks:
             owner_profile=self.gateway.fresh(allocation.owner, now),
             is_called=is_called,
         )
-        return decide(self.judges[name], Damping(), figures).judgement
+        return decide(self.judges[name], Fuse(), figures).judgement
 
 
 @st.composite

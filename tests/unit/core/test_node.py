@@ -381,7 +381,7 @@ def test_an_order_that_came_behind_a_move_is_not_told_as_the_move(revision: int,
     value = allocation_of(revision, "edge2", epoch, asked=Asked(by="ada@robot1"))
     node.handle(learnt_from("robot2", value), now)
     assert node.history["merge"][-1].reason == told
-    assert len(node.rounds.tasks["merge"].damping.memory().moves) == (told == FROM_A_PEER)
+    assert len(node.rounds.tasks["merge"].fuse.memory().moves) == (told == FROM_A_PEER)
 
 
 def test_an_owner_that_was_there_before_the_start_is_told_as_known_and_the_next_one_as_a_move() -> None:
@@ -943,6 +943,7 @@ def test_a_node_has_failed_by_a_vote_for_an_escape_and_not_because_this_robot_wa
 ) -> None:
     """What one robot holds against a node counts with all of them."""
     node = started(learnt=allocation_of(4, "edge1", 2))
+    node.rounds.tasks["merge"].judge.kept.look({"edge1": 0.9}, None, 90.0)
     while node.membership.state("edge1") is not PeerState.GONE:
         node.handle(ev.DeadlineReached(), node.next_deadline())
     now = node.next_deadline()
@@ -950,21 +951,23 @@ def test_a_node_has_failed_by_a_vote_for_an_escape_and_not_because_this_robot_wa
         paper = proposal_of(voter, "edge2", base_revision=4, is_escape=is_escape)
         node.votes.tasks["merge"].absorb(paper, node.values()["merge"], now)
     node.handle(learnt_from("robot3", allocation_of(5, "edge2", 3)), now)
-    assert set(node.rounds.tasks["merge"].damping.penalties(now)) == ({"edge1"} if is_failure else set())
+    assert set(node.rounds.tasks["merge"].judge.kept.seen) == ({"edge1"} if is_failure else set())
 
 
 def test_who_has_committed_an_escape_remembers_the_failure() -> None:
     node = started(learnt=allocation_of(4, "edge1", 2))
+    node.rounds.tasks["merge"].judge.kept.look({"edge1": 0.9}, None, 90.0)
     while node.membership.state("edge1") is not PeerState.GONE:
         node.handle(ev.DeadlineReached(), node.next_deadline())
     carry_out(node, allocation_of(5, "edge2", 3), "edge1 is gone", ToDo(), node.next_deadline())
-    assert set(node.rounds.tasks["merge"].damping.penalties(node.next_deadline())) == {"edge1"}
+    assert set(node.rounds.tasks["merge"].judge.kept.seen) == {"edge1"}
 
 
 @pytest.mark.parametrize("is_escape", [True, False])
 def test_a_node_that_is_silent_for_a_moment_has_failed_only_if_the_task_fled_from_it(*, is_escape: bool) -> None:
     """A machine is left because it is full, and then its beats come late: a planned move holds nothing against it."""
     node = started(learnt=allocation_of(4, "edge1", 2))
+    node.rounds.tasks["merge"].judge.kept.look({"edge1": 0.9}, None, 90.0)
     while node.membership.state("edge1") is not PeerState.SUSPECT:
         node.handle(ev.DeadlineReached(), node.next_deadline())
     now = node.next_deadline()
@@ -972,7 +975,7 @@ def test_a_node_that_is_silent_for_a_moment_has_failed_only_if_the_task_fled_fro
         paper = proposal_of(voter, "edge2", base_revision=4, is_escape=is_escape)
         node.votes.tasks["merge"].absorb(paper, node.values()["merge"], now)
     carry_out(node, allocation_of(5, "edge2", 3), "2 of 2 for edge2", ToDo(), now)
-    assert set(node.rounds.tasks["merge"].damping.penalties(now)) == ({"edge1"} if is_escape else set())
+    assert set(node.rounds.tasks["merge"].judge.kept.seen) == ({"edge1"} if is_escape else set())
 
 
 @pytest.mark.parametrize("is_escape", [True, False])
@@ -983,9 +986,9 @@ def test_a_flight_from_a_node_that_has_not_failed_counts_in_the_cap_of_escapes(*
         paper = proposal_of(voter, "edge2", base_revision=4, is_escape=is_escape)
         node.votes.tasks["merge"].absorb(paper, node.values()["merge"], 100.0)
     node.handle(learnt_from("robot3", allocation_of(5, "edge2", 3)), 100.1)
-    damping = node.rounds.tasks["merge"].damping
-    assert damping.penalties(100.1) == {}
-    assert damping.memory().moves == ((100.1, is_escape),)
+    task = node.rounds.tasks["merge"]
+    assert task.judge.kept.seen == {}
+    assert task.fuse.memory().moves == ((100.1, is_escape),)
 
 
 # --- an operator who has mended something ----------------------------------------------------------------------------
@@ -993,15 +996,16 @@ def test_a_flight_from_a_node_that_has_not_failed_counts_in_the_cap_of_escapes(*
 
 def test_a_worker_that_somebody_has_mended_is_held_against_its_node_no_more() -> None:
     node = make("robot1")
-    damping = node.rounds.tasks["merge"].damping
+    kept = node.rounds.tasks["merge"].judge.kept
+    kept.look(dict.fromkeys(EDGES, 0.9), None, 99.0)
     for left in EDGES:
-        damping.note_move(left, has_failed=True, now=100.0)
+        node.rounds.on_moved("merge", left, has_failed=True, now=100.0)
     tells = profile("edge1").profile
     for number, state in enumerate((WorkerState.FAILED, WorkerState.FAILED, WorkerState.STARTING), 5):
-        assert set(damping.penalties(100.0)) == set(EDGES)
+        assert set(kept.seen) == set(EDGES)
         loads = (WorkerLoad(task="merge", state=state),)
         node.handle(ev.ProfileReceived(profile=replace(tells, sequence=number, workers=loads)), 100.0)
-    assert set(damping.penalties(100.0)) == set(EDGES) - {"edge1"}
+    assert set(kept.seen) == set(EDGES) - {"edge1"}
 
 
 def test_a_worker_that_runs_by_an_old_recipe_is_started_again_once() -> None:

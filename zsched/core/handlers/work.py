@@ -165,7 +165,7 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     """Whether the task fled from the owner that it left: that one is not there, or its worker has failed.
 
     A node that is cut off misses everybody, so what it sees counts with a vote that it has taken part in. Of a move
-    behind its back it knows nothing; those who made it remember (`UtilityVector.penalties`). Who is silent for a moment
+    behind its back it knows nothing; those who made it remember. Who is silent for a moment
     while the task leaves it for a better one has not failed: a full machine's beats come late. ``is_ours``: this node
     has committed the value.
     """

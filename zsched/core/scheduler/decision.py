@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason, short_of_memory
 from zsched.core.scheduler.standing import Standing, compare, reaches_owner
 from zsched.core.values.decision import Figures, Rules, Verdict
@@ -42,15 +42,15 @@ class Decided(Struct, frozen=True, kw_only=True):
     """Another task's move holds it back."""
 
 
-def decide(judge: Judge, damping: Damping, figures: Figures) -> Decided:
-    """Judge by ``figures``; ``judge`` and ``damping`` hold the memory of which the figures have a copy."""
+def decide(judge: Judge, fuse: Fuse, figures: Figures) -> Decided:
+    """Judge by ``figures``; ``judge`` and ``fuse`` hold the memory of which the figures have a copy."""
     vectors = {vector.voter: vector for vector in figures.vectors}
     spec, allocation = judge.spec, figures.allocation
     lost_for_s = judge.lost_for(reaches_owner(spec, allocation, vectors), figures.now)
-    return decide_by(compare(spec, allocation, vectors, lost_for_s), judge, damping, figures)
+    return decide_by(compare(spec, allocation, vectors, lost_for_s), judge, fuse, figures)
 
 
-def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figures) -> Decided:
+def decide_by(compared: Standing, judge: Judge, fuse: Fuse, figures: Figures) -> Decided:
     """`decide` by the vectors of ``figures`` as `compare` has joined them: once for all who have the same."""
     allocation = figures.allocation
     standing = _keep_out(compared, figures)
@@ -80,7 +80,7 @@ def decide_by(compared: Standing, judge: Judge, damping: Damping, figures: Figur
             drained=figures.drained,
             is_called=figures.is_called,
             now=figures.now,
-            damping=damping,
+            fuse=fuse,
             is_unheard=figures.owner_state is PeerState.UNKNOWN,
         )
     if escape is None:
@@ -111,7 +111,7 @@ def decide_again(figures: Figures) -> Decided:
     spec = spec_of(figures)
     judge = Judge(spec=spec)
     judge.recall(figures.judge)
-    return decide(judge, Damping.of(figures.damping), figures)
+    return decide(judge, Fuse.of(figures.fuse), figures)
 
 
 def rules_of(spec: TaskSpec) -> Rules:

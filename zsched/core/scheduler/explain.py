@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from zsched.core.scheduler.damping import WINDOW_S, Damping
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.eligibility import is_for_comers
+from zsched.core.scheduler.fuse import WINDOW_S, Fuse
 from zsched.core.scheduler.judge import Outcome
-from zsched.core.scheduler.standing import RESOLUTION, Standing, counted, joined, mean_of, pick, rounded
+from zsched.core.scheduler.standing import RESOLUTION, Standing, counted, mean_of, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import NodeId, PeerState, Tuning, Utility, UtilityVector
@@ -46,7 +46,7 @@ class RobotView(Struct, frozen=True, kw_only=True):
 
 
 class CandidateSum(Struct, frozen=True, kw_only=True):
-    """``max(joint - unkept + bonus - penalty, 0) = total``; ``None`` where the candidate cannot have the task."""
+    """``joint - unkept + bonus = total``; ``None`` where the candidate cannot have the task."""
 
     node: NodeId
     is_owner: bool
@@ -55,7 +55,6 @@ class CandidateSum(Struct, frozen=True, kw_only=True):
     unkept: float
     """What the machine promised so before, and did not give (`zsched.core.scheduler.kept`)."""
     bonus: float
-    penalty: float
     total: float | None
     owed_s: float | None = None
     """Seconds of work that the task owes there, with what it will lose; ``None``: it cannot have it."""
@@ -216,14 +215,13 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
     """Every candidate's sum, the best first."""
     figures, standing = decision.figures, again.standing
     owner, tuning = figures.allocation.owner, figures.allocation.tuning
-    penalties = joined((Damping.of(figures.damping).penalties(figures.now), standing.penalties))
     needs = {need.candidate: need for need in decision.needs}
     found = []
     for name in figures.rules.candidates:
         is_left = name == owner and again.leaving is not None
         joint = standing.aggregates.get(name)
         bonus = tuning.bonus if name == owner and not is_left else 0.0
-        penalty, need = penalties.get(name, 0.0), needs.get(name)
+        need = needs.get(name)
         unkept = 0.0 if joint is None else joint - again.given[name]
         is_out = joint is None or is_left
         found.append(
@@ -233,8 +231,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
                 joint=joint,
                 unkept=unkept,
                 bonus=bonus,
-                penalty=penalty,
-                total=None if is_out or joint is None else max(joint - unkept + bonus - penalty, 0.0),
+                total=None if is_out or joint is None else joint - unkept + bonus,
                 owed_s=again.expected.get(name),
                 why_not=again.leaving or "" if is_left else standing.vetoed.get(name, ""),
                 need_cpu_cores=None if need is None else need.cpu_cores,
@@ -307,7 +304,7 @@ def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[C
         assert one.total is not None
         assert one.joint is not None
         if rounded(one.total) <= rounded(owner.total):
-            worth = math.ceil((needed + one.penalty + one.unkept) * _SHOWN) / _SHOWN
+            worth = math.ceil((needed + one.unkept) * _SHOWN) / _SHOWN
             lack, way = worth - one.joint, "or the"
             if worth <= 1.0:
                 yield f"{one.node} would have to be worth {worth:.4f} instead of {one.joint:.4f} ({lack:+.4f})"
@@ -332,8 +329,7 @@ def _times(figures: Figures, again: Decided, node: NodeId, owner: NodeId) -> Ite
     electors, heard = len(figures.electors), len(figures.electors_heard)
     if heard < majority(electors):
         yield f"until {majority(electors)} of {electors} electors are heard ({heard} are)"
-    damping = Damping.of(figures.damping)
-    if damping.moves_within(WINDOW_S, figures.now, escapes=False) >= figures.rules.max_moves_per_minute:
+    if Fuse.of(figures.fuse).moves_within(WINDOW_S, figures.now, escapes=False) >= figures.rules.max_moves_per_minute:
         yield f"until fewer than {figures.rules.max_moves_per_minute} moves lie in the last minute"
 
 
@@ -355,7 +351,7 @@ def owner_cpu_below(figures: Figures, standing: Standing, owner: CandidateSum, r
             lower = one if one.cpu is None else replace(one, cpu=min(one.cpu, level))
             values.append(utility_of(lower, tuning) or 0.0)
         mean = mean_of(tuning.aggregate)
-        return rounded(rival_total) > rounded(max(mean(values) + owner.bonus - owner.penalty, 0.0))
+        return rounded(rival_total) > rounded(mean(values) + owner.bonus)
 
     low, high = 0.0, max(terms)
     if not is_beaten(low):

@@ -16,10 +16,10 @@ from enum import StrEnum
 from typing import Final
 
 from zsched.core.absence import Absences
-from zsched.core.scheduler.damping import ESCAPES_PER_MINUTE, WINDOW_S, Damping
+from zsched.core.scheduler.fuse import ESCAPES_PER_MINUTE, WINDOW_S, Fuse
 from zsched.core.scheduler.kept import Kept
 from zsched.core.scheduler.ledger import Ledger
-from zsched.core.scheduler.standing import LOST_S, Standing, joined, rounded
+from zsched.core.scheduler.standing import LOST_S, Standing, rounded
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
@@ -158,7 +158,7 @@ class Judge:
         escape: str | None,
         is_called: bool,
         now: float,
-        damping: Damping | None = None,
+        fuse: Fuse | None = None,
         drained: str = "",
         is_unheard: bool = False,
     ) -> Judgement:
@@ -170,21 +170,16 @@ class Judge:
             escape: why the owner must be left at once (`escape_reason`), or ``None``.
             is_called: another robot called a vote: answer with who owes least, whatever a move costs.
             now: monotonic seconds.
-            damping: the task's record of moves, for the cap and the penalties (those that other robots remember, in
-                ``standing``, count as well); ``None``: neither.
+            fuse: the task's record of moves; ``None``: they are not bounded.
             drained: why the owner hands the task over, by an operator's order; empty: it need not.
             is_unheard: nobody here has ever heard the owner.
         """
         owner = allocation.owner
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
-        penalties = {} if damping is None else joined((damping.penalties(now), standing.penalties))
         self.kept.look(standing.aggregates, owner, now)
         given = self.kept.corrected(standing.aggregates, owner, self.spec.memory_s, now)
-        worth = {
-            name: max(value + (allocation.tuning.bonus if name == owner else 0.0) - penalties.get(name, 0.0), 0.0)
-            for name, value in given.items()
-        }
+        worth = {name: value + (allocation.tuning.bonus if name == owner else 0.0) for name, value in given.items()}
         home = allocation.home
         scored = {
             name: value
@@ -201,8 +196,8 @@ class Judge:
         is_kept = allocation.home is not None and not (is_unheard and winner != allocation.home)
         outcome, reason = self._outcome(winner, expected, allocation, leaving, is_called, now, is_kept)
         cap = None
-        if damping is not None and owner is not None and not is_drain:
-            cap = self._cap(damping, is_escape=escape is not None, now=now)
+        if fuse is not None and owner is not None and not is_drain:
+            cap = self._cap(fuse, is_escape=escape is not None, now=now)
         if outcome is Outcome.PROPOSE and cap is not None:
             outcome, reason = Outcome.WAIT, f"{reason}; {cap}"
         chosen = winner if outcome is Outcome.PROPOSE else owner
@@ -229,10 +224,10 @@ class Judge:
         self.ledger.charge(losses, owner, price_s=self.spec.price_s, memory_s=self.spec.memory_s, now=now)
         return self.ledger.expected(losses)
 
-    def _cap(self, damping: Damping, *, is_escape: bool, now: float) -> str | None:
+    def _cap(self, fuse: Fuse, *, is_escape: bool, now: float) -> str | None:
         """Why no further move is allowed in this minute, or ``None``."""
         limit = ESCAPES_PER_MINUTE if is_escape else self.spec.max_moves_per_minute
-        done = damping.moves_within(WINDOW_S, now, escapes=is_escape)
+        done = fuse.moves_within(WINDOW_S, now, escapes=is_escape)
         return None if done < limit else f"{done} moves in the last minute, at most {limit}"
 
     def _outcome(

@@ -30,7 +30,7 @@ class Kept(Struct):
     since: float = 0.0
     """When this owner was first seen."""
     foretold: dict[NodeId, float] = field(default_factory=dict)
-    """{machine: its worth when it was last judged without the task}."""
+    """{machine: its worth when it was last judged without the task, or first}."""
     seen: dict[NodeId, tuple[float, float, float]] = field(default_factory=dict)
     """{machine: (what it promised, what it gave, when)}."""
 
@@ -75,7 +75,18 @@ class Kept(Struct):
             if before is not None and now - self.since >= SETTLE_S:
                 gave = max(gave, before[1])
             self.seen[owner] = (self.foretold[owner], gave, now)
-        self.foretold |= {name: value for name, value in worth.items() if name != owner}
+        self.foretold |= {name: value for name, value in worth.items() if name != owner or name not in self.foretold}
+
+    def fail(self, node: NodeId, now: float) -> None:
+        """The machine was left because it failed: it gave half of what it promised, or half of what it gave before."""
+        if node in self.foretold:
+            promised, gave, _ = self.seen.get(node, (self.foretold[node],) * 2 + (now,))
+            self.seen[node] = (promised, min(gave, promised) / 2.0, now)
+
+    def unkept(self, worth: Mapping[NodeId, float], memory_s: float, now: float) -> dict[NodeId, float]:
+        """{machine: what is taken off its worth}, of those from which something is."""
+        found = self.corrected(worth, self.owner, memory_s, now)
+        return {name: worth[name] - found[name] for name in worth if found[name] < worth[name]}
 
     def corrected(
         self, worth: Mapping[NodeId, float], owner: NodeId | None, memory_s: float, now: float

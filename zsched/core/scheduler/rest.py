@@ -38,7 +38,7 @@ def _is_like(new: UtilityVector, old: UtilityVector) -> bool:
     if _names(new) != _names(old):
         return False
     utilities = {one.candidate: one.value for one in new.utilities}, {one.candidate: one.value for one in old.utilities}
-    return _is_near(*utilities) and _is_near(dict(new.penalties), dict(old.penalties))
+    return _is_near(*utilities)
 
 
 def _names(vector: UtilityVector) -> tuple[list[NodeId], list[NodeId], list[NodeId]]:

@@ -22,10 +22,10 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.claims import claims_of_others, taken
-from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
 from zsched.core.scheduler.eligibility import has_living_owner, is_out
 from zsched.core.scheduler.flags import NodeFlags
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.rest import Answers, is_like
 from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, score
@@ -74,7 +74,7 @@ class TaskRound:
     judgement: Judgement | None = None
     judged_at: float = -math.inf
     silent: tuple[NodeId, ...] = ()
-    damping: Damping = field(default_factory=Damping)
+    fuse: Fuse = field(default_factory=Fuse)
     takes_turns: bool = False
     """Whether what was last judged waits for other tasks' moves."""
     is_waiting_its_turn: bool = False
@@ -210,7 +210,6 @@ class Rounds:
                     now,
                     bookings,
                     doubts[name],
-                    task.damping.penalties(now),
                     round_trips,
                 )
                 for name, task in self.tasks.items()
@@ -336,7 +335,7 @@ class Rounds:
         task.under(allocation.tuning)
         figures = self._figures(task, vectors, values, states, now)
         is_called, task.is_called, task.is_called_escape = task.is_called, False, False
-        decided = decide(task.judge, task.damping, figures)
+        decided = decide(task.judge, task.fuse, figures)
         judgement = decided.judgement
         task.standing, task.judgement, task.judged_at = decided.standing, judgement, now
         task.figures, task.is_waiting_its_turn = figures, decided.is_waiting_its_turn
@@ -402,7 +401,7 @@ class Rounds:
             claimed=tuple(sorted(self._claimed(task.spec, values, states, now).items())),
             drained="" if owner is None else self._flags.drained.get(owner, ""),
             judge=task.judge.memory(),
-            damping=task.damping.memory(),
+            fuse=task.fuse.memory(),
         )
 
     def _claimed(
@@ -467,19 +466,21 @@ class Rounds:
         is_escape: bool = False,
         is_ordered: bool = False,
     ) -> None:
-        """A new owner is known: ``left`` is the one before (`Damping.note_move`)."""
-        self.tasks[name].damping.note_move(
-            left,
-            has_failed=has_failed,
-            was_draining=was_draining,
-            is_escape=is_escape,
-            is_ordered=is_ordered,
-            now=now,
-        )
+        """A new owner is known: ``left`` is the one before (``None``: the first placement, which is no move).
+
+        A node that drained was told to: that says nothing against it, however soon, and though it is gone by now. Nor
+        does an operator's move. ``is_escape``: it was fled from, though it may not have failed.
+        """
+        if left is None or is_ordered:
+            return
+        task = self.tasks[name]
+        task.fuse.note_move(is_escape=has_failed or is_escape, now=now)
+        if has_failed and not was_draining:
+            task.judge.kept.fail(left, now)
 
     def forgive(self, name: TaskId, node: NodeId, now: float) -> None:
         """An operator has mended what was held against a node; judge again at once."""
-        self.tasks[name].damping.forgive(node)
+        self.tasks[name].judge.kept.seen.pop(node, None)
         self._answer = (-1, -math.inf, None, self._answer[-1])  # it tells of what is forgotten now
         self.hurry(now)
 

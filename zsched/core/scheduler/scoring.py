@@ -105,7 +105,6 @@ def score(
     now: float,
     bookings: Bookings | None = None,
     doubts: Doubts = NO_DOUBTS,
-    penalties: Mapping[NodeId, float] = NOTHING_HELD,
     round_trips: Mapping[NodeId, float] = NOTHING_HELD,
 ) -> UtilityVector:
     """This robot's utilities of a task's candidates, by the tuning of ``allocation``.
@@ -113,7 +112,7 @@ def score(
     A candidate that this robot cannot reach gets 0 (not: is left out, which would raise its mean); one that may not
     have the task is refused with the reason. Where there are ``doubts`` about a node, it keeps
     what it has and gets nothing new. What the other tasks of ``bookings`` will use there, and do not show yet, counts
-    as in use. ``penalties`` are what this robot remembers; they go along, and `compare` joins them. ``round_trips`` are
+    as in use. ``round_trips`` are
     seconds to each candidate and back, where measured (`zsched.core.gateway.round_trips`).
 
     Memory that a worker has come to use forbids a candidate that lacks it, while the task runs elsewhere. Without an
@@ -153,7 +152,6 @@ def score(
         revision=allocation.revision,
         utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
         refused=tuple(sorted((*refused, *unmeasured))),
-        penalties=tuple(sorted((name, round(penalty, 4)) for name, penalty in penalties.items())),
     )
 
 

@@ -1,6 +1,6 @@
 """SCHEDULER: joins all robots' scores of a task's candidates (Alg. 2, Compare_Utility).
 
-Knows: Eq. 5-6, vetoes, penalties. Does not know: how a score is made (`zsched.core.scheduler.scoring`), stickiness
+Knows: Eq. 5-6, vetoes. Does not know: how a score is made (`zsched.core.scheduler.scoring`), stickiness
 (`zsched.core.scheduler.judge`), how scores travel.
 """
 
@@ -10,11 +10,10 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping
 
-from zsched.core.scheduler.damping import MAX_PENALTY
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
-from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.struct import Struct, replace
 
 LOST_S = 3.0
 """Where all candidates stand at the limit of their signals, the owner is not reached for a moment now and then."""
@@ -38,8 +37,6 @@ class Standing(Struct, frozen=True, kw_only=True):
     vetoed: Mapping[NodeId, str]
     vectors: tuple[UtilityVector, ...]
     voters_heard: int
-    penalties: Mapping[NodeId, float] = field(default_factory=dict)
-    """{node: what is held against it}, by the robot that remembers most."""
 
 
 def reaches_owner(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> bool:
@@ -102,7 +99,6 @@ def compare(
         vetoed=vetoed,
         vectors=fresh,
         voters_heard=len(fresh),
-        penalties=joined(dict(vector.penalties) for vector in fresh),
     )
 
 
@@ -146,21 +142,6 @@ def _aggregates(
 ) -> dict[NodeId, float]:
     told = [{one.candidate: one.value for one in vector.utilities} for vector in counted(candidates, vectors)]
     return {name: mean([values[name] for values in told if name in values]) for name in candidates}
-
-
-def joined(penalties: Iterable[Mapping[NodeId, float]]) -> dict[NodeId, float]:
-    """What any of them holds against a node, the most of it: forgetting (a restart) and not knowing say nothing.
-
-    No robot's word costs a node more than `MAX_PENALTY`, whatever it says.
-
-    >>> joined([{"edge1": 0.09}, {}, {"edge1": 0.03, "edge2": 0.03}])
-    {'edge1': 0.09, 'edge2': 0.03}
-    """
-    most: dict[NodeId, float] = {}
-    for held in penalties:
-        for name, penalty in held.items():
-            most[name] = max(min(penalty, MAX_PENALTY), most.get(name, 0.0))
-    return dict(sorted(most.items()))
 
 
 def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:

@@ -56,11 +56,9 @@ class JudgeMemory(Struct, frozen=True, kw_only=True):
     fit_since: float | None = None
 
 
-class DampingMemory(Struct, frozen=True, kw_only=True):
-    """The record of moves that a judgement begins with (`zsched.core.scheduler.damping.Damping`)."""
+class FuseMemory(Struct, frozen=True, kw_only=True):
+    """The record of moves that a judgement begins with (`zsched.core.scheduler.fuse.Fuse`)."""
 
-    points: tuple[tuple[NodeId, float, float], ...] = ()
-    """(node, points, when), sorted."""
     moves: tuple[tuple[float, bool], ...] = ()
     """(when, whether it was an escape), oldest first."""
 
@@ -100,11 +98,11 @@ class Figures(Struct, frozen=True, kw_only=True):
     drained: str = ""
     """Why the owner hands the task over, by an operator's flag; empty: it need not."""
     judge: JudgeMemory = JudgeMemory()
-    damping: DampingMemory = DampingMemory()
+    fuse: FuseMemory = FuseMemory()
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
-    """A judgement as a plain value; ``aggregates`` with bonus and penalties, sorted."""
+    """A judgement as a plain value; ``aggregates`` with the bonus, by what was kept, sorted."""
 
     outcome: str
     candidate: NodeId | None

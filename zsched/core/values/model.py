@@ -285,15 +285,11 @@ class UtilityVector(Struct, frozen=True, kw_only=True):
     utilities: tuple[Utility, ...]
     refused: tuple[tuple[NodeId, str], ...] = ()
     """Candidates this voter did not score, each with its reason."""
-    penalties: tuple[tuple[NodeId, float], ...] = ()
-    """This voter's penalties against nodes, each in [0, 1] (`zsched.core.scheduler.damping`)."""
 
     def __post_init__(self) -> None:
         check_name("vector.voter", self.voter)
         check_name("vector.task", self.task)
         check_counter("vector.revision", self.revision)
-        for _, penalty in self.penalties:
-            check_range("vector.penalties", penalty, 0.0, 1.0)
 
 
 class Proposal(Struct, frozen=True, kw_only=True):

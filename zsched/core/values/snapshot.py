@@ -87,8 +87,8 @@ class DecisionStatus(Struct, frozen=True, kw_only=True):
     utilities: tuple[tuple[NodeId, tuple[Utility, ...]], ...] = ()
     """(voter, its utilities)."""
     vetoed: tuple[tuple[NodeId, str], ...] = ()
-    penalties: tuple[tuple[NodeId, float], ...] = ()
-    """What nodes that failed or were left often pay, in utility units."""
+    unkept: tuple[tuple[NodeId, float], ...] = ()
+    """What is taken off machines that promised as much before, and did not give it, or failed."""
     silent: tuple[NodeId, ...] = ()
     """Robots whose utilities did not come in time."""
 

@@ -131,7 +131,7 @@ def test_a_move_is_agreed_without_a_vote_and_says_who_ordered_it() -> None:
     assert (lone.value().owner, lone.value().epoch, lone.value().asked, lone.value().pinned) == ("edge2", 4, ADA, False)
     past = build_snapshot(lone.node, lone.now).tasks[0].history[-1]
     assert (past.owner, past.reason, past.by) == ("edge2", "moved by ada@robot1 (new battery)", "ada@robot1")
-    assert lone.node.rounds.tasks["merge"].damping.memory().moves == (), "damping does not count it"
+    assert lone.node.rounds.tasks["merge"].fuse.memory().moves == (), "the fuse does not count it"
 
 
 def test_a_plan_moves_nothing() -> None:

@@ -8,9 +8,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
-from zsched.core.scheduler.damping import MAX_PENALTY
 from zsched.core.scheduler.standing import Standing, compare, pick, rounded
-from zsched.core.scheduler.standing import joined as joined_penalties
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
@@ -169,7 +167,3 @@ def test_a_candidate_gains_nothing_by_a_far_robot_that_leaves_it_out(aggregate: 
     if aggregate is Aggregate.MEAN:
         assert found.aggregates == {"edge1": pytest.approx(0.7), "edge2": pytest.approx(0.4)}, "one robot scores both"
     assert found.vetoed == {"edge3": "not scored by enough robots"}
-
-
-def test_no_robot_s_word_costs_a_machine_more_than_flaps_can() -> None:
-    assert joined_penalties([{"edge1": 1.0}, {"edge1": 0.1, "edge2": 0.1}]) == {"edge1": MAX_PENALTY, "edge2": 0.1}

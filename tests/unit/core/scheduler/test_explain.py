@@ -26,7 +26,7 @@ from zsched.core.scheduler.explain import (
 )
 from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.standing import pick
-from zsched.core.values.decision import DampingMemory, Decision, JudgeMemory, Need
+from zsched.core.values.decision import Decision, FuseMemory, JudgeMemory, KeptMemory, Need
 from zsched.core.values.model import (
     Aggregate,
     Allocation,
@@ -67,25 +67,23 @@ def decision_of(tuning: Tuning = TUNING, *, owner: str | None = "edge1", **chang
     given = {
         "allocation": allocation_of(4, owner, 3, tuning=tuning),
         "vectors": tuple(vectors),
-        "damping": DampingMemory(points=(("edge3", 1.0, 990.0),)),
     }
     figures = figures_of(task_of(candidates=EDGES, price_s=0.15), *ROBOTS, **{**given, **changes})
     needs = (Need(candidate="edge1", cpu_cores=0.4, memory_mb=250.0),)
     return Decision(figures=figures, verdict=verdict_of(decide_again(figures).judgement), needs=needs)
 
 
-def decision_worth(worth: Mapping[str, float], *, bonus: float = 0.0, penalty: float = 0.0) -> Decision:
-    """Three robots that agree on what each edge is worth; edge1 owns the task, edge2 has a penalty if anybody has."""
+def decision_worth(worth: Mapping[str, float], *, bonus: float = 0.0) -> Decision:
+    """Three robots that agree on what each edge is worth; edge1 owns the task."""
     decision = decision_of(replace(TUNING, bonus=bonus))
     vectors = tuple(
         replace(
             vector,
             utilities=tuple(replace(one, value=worth[one.candidate]) for one in vector.utilities),
-            penalties=(("edge2", penalty),),
         )
         for vector in decision.figures.vectors
     )
-    return judged_again(decision, replace(decision.figures, vectors=vectors, damping=DampingMemory()))
+    return judged_again(decision, replace(decision.figures, vectors=vectors, judge=JudgeMemory()))
 
 
 def check_sums(told: Explained, decision: Decision) -> None:
@@ -106,7 +104,7 @@ def check_sums(told: Explained, decision: Decision) -> None:
             assert one.joint == mean(seen)
         if one.total is not None:
             assert one.joint is not None
-            assert one.total == max(one.joint + one.bonus - one.penalty, 0.0)
+            assert one.total == one.joint - one.unkept + one.bonus
     assert {one.node: one.total for one in told.candidates if one.total is not None} == dict(
         decision.verdict.aggregates
     )
@@ -116,13 +114,20 @@ def check_sums(told: Explained, decision: Decision) -> None:
 @pytest.mark.parametrize("aggregate", list(Aggregate))
 @pytest.mark.parametrize("owner", [None, *EDGES])
 def test_the_numbers_add_up(score: ScoreForm, aggregate: Aggregate, owner: str | None) -> None:
-    decision = decision_of(replace(TUNING, score=score, aggregate=aggregate), owner=owner)
+    tuning = replace(TUNING, score=score, aggregate=aggregate)
+    promised = {one.node: one.joint or 0.0 for one in explained(decision_of(tuning, owner=owner)).candidates}
+    kept = KeptMemory(owner=owner, seen=(("edge3", promised["edge3"], 0.0, 990.0),))
+    decision = decision_of(tuning, owner=owner, judge=JudgeMemory(kept=kept))
     told = explained(decision)
     check_sums(told, decision)
     assert [one.node for one in told.candidates if one.is_owner] == ([] if owner is None else [owner])
     totals = {one.node: one.total for one in told.candidates if one.total is not None}
     assert told.candidates[0].node == pick(totals, owner)
-    assert [one.penalty > 0.0 for one in sorted(told.candidates, key=lambda one: one.node)] == [False, False, True]
+    assert [one.unkept > 0.0 for one in sorted(told.candidates, key=lambda one: one.node)] == [
+        False,
+        False,
+        owner != "edge3",
+    ]
     assert told.margin is not None
 
 
@@ -146,7 +151,7 @@ def test_a_candidate_that_lacks_worth_moves_the_task_when_it_has_it() -> None:
     needed = float(text.split("worth ")[1].split(" ")[0])
     totals = {one.node: one.total for one in told.candidates if one.total is not None}
     for change, winner in ((0.0, best.node), (-1e-4, "edge1")):
-        assert pick({**totals, best.node: needed - best.penalty + change}, "edge1") == winner
+        assert pick({**totals, best.node: needed - best.unkept + change}, "edge1") == winner
 
 
 def test_the_worth_that_is_named_lies_above_the_middle_between_two_steps() -> None:
@@ -165,18 +170,6 @@ def test_the_worth_that_is_named_is_enough_whatever_the_owner_s_is(seed: int) ->
     needed = float(told.changes[0].split("worth ")[1].split(" ")[0])
     again = explained(decision_worth({**worth, "edge2": needed}))
     assert again.changes[0].startswith("edge1 owes")
-
-
-@pytest.mark.parametrize("joint", [0.1, 0.34, 0.36, 0.6])
-def test_the_worth_that_is_named_makes_up_for_a_penalty_also_above_the_joint_worth(joint: float) -> None:
-    """A total is never below 0: what is lacked is more than the distance between the totals then."""
-    worth = {"edge1": 0.4, "edge2": joint, "edge3": 0.0}
-    told = explained(decision_worth(worth, penalty=0.35))
-    lack = 0.7509 - joint
-    assert told.changes[0] == f"edge2 would have to be worth 0.7509 instead of {joint:.4f} ({lack:+.4f})"
-    for needed, begins in ((0.7509, "edge1 owes"), (0.7508, "edge2 would have to be worth")):
-        again = explained(decision_worth({**worth, "edge2": needed}, penalty=0.35))
-        assert again.changes[0].startswith(begins)
 
 
 def test_a_rival_that_no_worth_would_make_the_leader_is_told_so() -> None:
@@ -259,7 +252,7 @@ def test_a_leader_that_waits_is_told_what_its_lead_has_cost() -> None:
         ({"first": "count"}, "until count has moved"),
         ({"electors_heard": ("robot1",)}, "until 2 of 3 electors are heard (1 are)"),
         (
-            {"damping": DampingMemory(moves=((990.0, False),) * 30)},
+            {"fuse": FuseMemory(moves=((990.0, False),) * 30)},
             "until fewer than {most} moves lie in the last minute",
         ),
     ],

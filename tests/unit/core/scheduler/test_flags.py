@@ -12,9 +12,9 @@ from support.allocations import allocation_of
 from support.decisions import figures_of
 from support.fleets import task_of
 from support.proposals import vector_of
-from zsched.core.scheduler.damping import Damping
 from zsched.core.scheduler.decision import decide
 from zsched.core.scheduler.flags import AGAIN_S, SPREAD_S, NodeFlags, told_flag
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.values.decision import Figures
 from zsched.core.values.document import Flag, FlagKind
@@ -129,7 +129,7 @@ def figures(draw: st.DrawFn) -> Figures:
 
 @given(figures())
 def test_a_flagged_node_gets_nothing_new_and_a_drained_owner_never_stays_while_another_is_fit(told: Figures) -> None:
-    decided = decide(Judge(spec=SPEC), Damping(), told)
+    decided = decide(Judge(spec=SPEC), Fuse(), told)
     judgement, owner, closed = decided.judgement, told.allocation.owner, dict(told.closed)
     if judgement.candidate != owner:
         assert judgement.candidate not in closed

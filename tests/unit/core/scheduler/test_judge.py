@@ -11,7 +11,7 @@ from support.fleets import task_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import vector_of
 from zsched.core.absence import Absences
-from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import (
     FIT_S,
     INITIAL_SETTLE_S,
@@ -51,7 +51,7 @@ def judged(
     called: bool = False,
     agreed: Allocation | None = None,
     drained: str = "",
-    damping: Damping | None = None,
+    fuse: Fuse | None = None,
     is_unheard: bool = False,
 ) -> Judgement:
     return judge.judge(
@@ -61,7 +61,7 @@ def judged(
         is_called=called,
         now=now,
         drained=drained,
-        damping=damping,
+        fuse=fuse,
         is_unheard=is_unheard,
     )
 
@@ -609,10 +609,10 @@ WORSE = {"edge1": 0.9, "edge2": 0.2}
 @pytest.mark.parametrize("agreed", [allocation(), pinned_to("edge1"), pinned_to("edge3")])
 def test_a_drained_owner_is_left_for_a_worse_one_at_once_and_planned(agreed: Allocation) -> None:
     """Neither bonus, price, cap nor pin holds it."""
-    damping = Damping()
+    fuse = Fuse()
     for number in range(10):
-        damping.note_move("edge3", has_failed=False, now=99.0 + number / 10)
-    left = judged(Judge(spec=SPEC), WORSE, 100.0, agreed=agreed, drained=DRAIN, damping=damping)
+        fuse.note_move(is_escape=False, now=99.0 + number / 10)
+    left = judged(Judge(spec=SPEC), WORSE, 100.0, agreed=agreed, drained=DRAIN, fuse=fuse)
     assert (left.outcome, left.candidate, left.is_escape) == (Outcome.PROPOSE, "edge2", False)
     assert left.reason == f"edge1 is {DRAIN}"
 

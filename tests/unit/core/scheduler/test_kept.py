@@ -75,3 +75,14 @@ def test_it_is_a_value_and_nothing_is_known_of_a_node_that_is_no_more() -> None:
     assert Kept.of(kept.memory()) == kept
     kept.keep(("edge1",))
     assert ({*kept.seen}, {*kept.foretold}) == ({"edge1"}, {"edge1"})
+
+
+def test_a_machine_that_failed_counts_as_half_of_what_it_promised_and_again_half() -> None:
+    kept = Kept()
+    look(kept, HOME, "edge1", 0.0)
+    kept.fail("edge2", 0.0)
+    assert worth_of_edge2(kept, 0.0) == pytest.approx(0.45)
+    kept.fail("edge2", 0.0)
+    assert worth_of_edge2(kept, 0.0) == pytest.approx(0.225)
+    kept.fail("edge3", 0.0)
+    assert "edge3" not in kept.seen, "nobody knows what it promised"

@@ -27,7 +27,6 @@ def test_an_answer_is_like_one_with_figures_that_differ_by_less_than_a_news() ->
         vector_of("robot1", {"edge1": 0.7}, 5),
         vector_of("robot1", {"edge1": 0.7, "edge2": 0.5}, 6),
         replace(OLD, refused=(("edge3", "no fresh profile"),)),
-        replace(OLD, penalties=(("edge1", 0.1),)),
         replace(OLD, utilities=(OLD.utilities[0], replace(OLD.utilities[1], reachable=False))),
         replace(OLD, utilities=(OLD.utilities[0], replace(OLD.utilities[1], at_limit=True))),
     ],

@@ -832,16 +832,3 @@ def test_a_new_owner_has_all_its_time_to_get_ready_and_new_weights_give_none(is_
     robot.decider.on_learnt("merge", is_new_epoch=is_new_epoch, now=robot.now)
     assert robot.task.judge.ledger.owed == owed, "or it would go back and forth"
     assert robot.task.judge.absences.since == (None if is_new_epoch else 90.0)
-
-
-def test_what_an_operator_has_forgiven_is_told_no_more_though_no_profile_has_come_since() -> None:
-    robot = Robot()
-    robot.rounds.on_moved("merge", "edge2", has_failed=True, now=robot.now)
-
-    def held() -> list[str]:
-        (vector,) = robot.rounds.vectors(robot.values(), robot.states, robot.now).vectors
-        return [name for name, _ in vector.penalties]
-
-    assert held() == ["edge2"]
-    robot.rounds.forgive("merge", "edge2", robot.now)
-    assert held() == [], "or this robot's next judgement, and the others', hold it against the node all the same"

@@ -260,13 +260,6 @@ def test_figures_keep_within_both_ends(value: Any, field: str, told: str, ends: 
             replace(value, **{field: bad})
 
 
-def test_a_penalty_is_a_ratio() -> None:
-    for bad in (-0.01, 1.01):
-        with pytest.raises(ValueError, match=r"vector\.penalties"):
-            replace(VECTOR, penalties=(("e1", 0.5), ("e2", bad)))
-    assert replace(VECTOR, penalties=(("e1", 0.0), ("e2", 1.0))).penalties
-
-
 def test_what_a_worker_says_of_itself_has_a_length() -> None:
     assert len(replace(LOAD, reason="x" * 400).reason) == len(replace(TROUBLE, text="x" * 400).text) == 400
     with pytest.raises(ValueError, match=r"worker\.reason: 401 characters, at most 400"):

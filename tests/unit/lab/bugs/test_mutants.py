@@ -181,21 +181,21 @@ def run(tmp_path: Path, tests: Path, *given: Mutant | str) -> str:
 
 
 def test_the_command_plants_into_functions_and_into_what_the_import_runs(tmp_path: Path) -> None:
-    """Both ways: `majority` is called, `EARLY_FAILURE_S` is made at the import."""
-    quorum, damping = (
+    """Both ways: `majority` is called, `WINDOW_S` is made at the import."""
+    quorum, fuse = (
         mutants_of(f"zsched.core.{name}".replace("/", "."), (CORE / f"{name}.py").read_text(encoding="utf-8"))
-        for name in ("values/quorum", "scheduler/damping")
+        for name in ("values/quorum", "scheduler/fuse")
     )
     found = [one for one in quorum if one.function == "=majority"]
-    made = [one for one in damping if one.before == "30.0"]
+    made = [one for one in fuse if one.before == "60.0"]
     assert found
     assert made
     good = tmp_path / "test_good.py"
     good.write_text(
-        "from zsched.core.scheduler.damping import EARLY_FAILURE_S\n"
+        "from zsched.core.scheduler.fuse import WINDOW_S\n"
         "from zsched.core.values.quorum import majority\n"
         "def test_majority():\n    assert [majority(n) for n in range(1, 6)] == [1, 2, 2, 3, 3]\n"
-        "def test_made():\n    assert EARLY_FAILURE_S == 30.0\n",
+        "def test_made():\n    assert WINDOW_S == 60.0\n",
         encoding="utf-8",
     )
     text = run(tmp_path, good, found[0], made[0])

@@ -88,7 +88,7 @@ def test_an_escape_is_kept_apart_from_planned_moves() -> None:
             break
     (first, fled) = rule.moves
     assert (first.owner, fled.left, fled.is_escape) == ("edge001", "edge001", True)
-    assert [rule._damping.moves_within(60.0, now, escapes=is_escape) for is_escape in (True, False)] == [1, 0]
+    assert [rule._fuse.moves_within(60.0, now, escapes=is_escape) for is_escape in (True, False)] == [1, 0]
 
 
 def test_a_move_that_costs_more_waits_longer() -> None:

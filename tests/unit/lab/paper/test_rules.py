@@ -8,7 +8,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from zsched.core.scheduler import rounds
-from zsched.core.scheduler.damping import Damping
+from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.standing import Standing
 from zsched_lab.paper.ruled_daemon import install
@@ -29,7 +29,7 @@ def plan(tmp_path: Path) -> Path:
 
 def judged(judge: Judge, values: dict[str, float], now: float, *, is_called: bool = False) -> Judgement:
     standing = Standing(aggregates=values, vetoed={}, vectors=(), voters_heard=3)
-    return judge.judge(standing, OWNED, escape=None, is_called=is_called, now=now, damping=Damping())
+    return judge.judge(standing, OWNED, escape=None, is_called=is_called, now=now, fuse=Fuse())
 
 
 def test_undamped_is_the_products_argmax() -> None:
@@ -38,12 +38,12 @@ def test_undamped_is_the_products_argmax() -> None:
     assert (judgement.outcome, judgement.candidate) == (Outcome.PROPOSE, "e2")
 
 
-def test_undamped_forgets_what_damping_remembers_and_the_cap_of_moves() -> None:
-    damping = Damping()
+def test_undamped_has_no_bound_on_moves() -> None:
+    fuse = Fuse()
     for at in range(20):
-        damping.note_move("e2", has_failed=False, now=float(at))
+        fuse.note_move(is_escape=False, now=float(at))
     standing = Standing(aggregates=VALUES, vetoed={}, vectors=(), voters_heard=3)
-    given = {"escape": None, "is_called": False, "now": 20.0, "damping": damping}
+    given = {"escape": None, "is_called": False, "now": 20.0, "fuse": fuse}
 
     assert Judge(spec=SPEC).judge(standing, OWNED, **given).outcome is not Outcome.PROPOSE  # type: ignore[arg-type]  # one dict for both
     assert JudgeMaker(name=RuleName.UNDAMPED)(spec=SPEC).judge(standing, OWNED, **given).outcome is Outcome.PROPOSE

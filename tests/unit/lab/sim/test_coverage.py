@@ -35,7 +35,7 @@ def test_branches_of_what_was_run_are_told_apart_from_the_others(
 ) -> None:
     pytest.importorskip("coverage", reason="an environment from before the dev extra had coverage.py")
     monkeypatch.chdir(ROOT)
-    watch(["pytest", "-q", "-p", "no:cacheprovider", "tests/unit/core/scheduler/test_damping.py"], tmp_path / "tests.0")
-    gone, left = reached(merge(tmp_path, "tests"))["zsched/core/scheduler/damping.py"]
+    watch(["pytest", "-q", "-p", "no:cacheprovider", "tests/unit/core/scheduler/test_fuse.py"], tmp_path / "tests.0")
+    gone, left = reached(merge(tmp_path, "tests"))["zsched/core/scheduler/fuse.py"]
     assert gone
     assert not gone & left

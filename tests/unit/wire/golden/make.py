@@ -92,7 +92,6 @@ _DECISION = decision.Decision(
         judge=decision.JudgeMemory(
             not_ready_since=1230.25,
         ),
-        damping=decision.DampingMemory(points=(("edge2", 2.0, 1200.0),), moves=((1200.5, True),)),
     ),
     verdict=decision.Verdict(
         outcome="wait",

@@ -170,13 +170,13 @@ function explained(body) {
   if (body.error) return h("p", { class: "explain bad" }, body.error);
   const rows = body.candidates.map((one) => h("tr", {}, h("td", {}, one.node),
     h("td", { class: "number" }, number(one.joint, 4)), h("td", { class: "number" }, number(one.unkept, 4)), h("td", { class: "number" }, number(one.bonus, 3)),
-    h("td", { class: "number" }, number(one.penalty, 3)), h("td", { class: "number" }, number(one.total, 4)),
+    h("td", { class: "number" }, number(one.total, 4)),
     h("td", { class: "text bad" }, one.why_not || "")));
-  const titles = ["candidate", "joint", "not kept", "bonus", "penalty", "total", ""];
+  const titles = ["candidate", "joint", "not kept", "bonus", "total", ""];
   return h("div", { class: "explain" },
     h("p", {}, `${body.outcome} ${body.candidate || ""}: ${body.reason}`),
     h("p", { class: "dim" }, `as ${body.node} judged it ${span(body.age_s)} ago · a move costs ${number(body.price_s, 1)} s · ${body.heard.length} robots heard, ${body.needed} needed`),
-    h("div", { class: "scroll" }, h("table", {}, h("tr", {}, titles.map((title, at) => h("th", { class: at && at < 6 ? "number" : "" }, title))), rows)),
+    h("div", { class: "scroll" }, h("table", {}, h("tr", {}, titles.map((title, at) => h("th", { class: at && at < 5 ? "number" : "" }, title))), rows)),
     body.changes.map((change) => h("p", {}, change)));
 }
 
