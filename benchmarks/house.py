@@ -27,8 +27,9 @@ HERE: Final = Path(__file__).parents[1]
 GENERATED: Final = "_version.py"
 BUDGET: Final = HERE / "benchmarks" / "budget.toml"
 LARGE_CLASS: Final = 300
-_NO_CODE: Final = frozenset({tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT})
-_NO_CODE_EITHER: Final = frozenset({tokenize.ENCODING, tokenize.ENDMARKER})
+_NO_CODE: Final = frozenset(
+    {tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT, tokenize.ENDMARKER}
+)
 
 Graph = Mapping[str, frozenset[str]]
 
@@ -137,7 +138,7 @@ def code_lines(text: str) -> int:
     }
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         is_docstring = token.type == tokenize.STRING and token.start[0] in told
-        if token.type not in _NO_CODE | _NO_CODE_EITHER and not is_docstring:
+        if token.type not in _NO_CODE and not is_docstring:
             lines.update(range(token.start[0], token.end[0] + 1))
     return len(lines)
 

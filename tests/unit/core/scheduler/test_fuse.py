@@ -16,6 +16,14 @@ def standing(**aggregates: float) -> Standing:
     return Standing(aggregates=aggregates, vetoed={}, vectors=(), voters_heard=3)
 
 
+def blown() -> Fuse:
+    """After as many moves as there may be in a minute, the last one at 110."""
+    fuse = Fuse()
+    for at in (100.0, 110.0):
+        fuse.note_move(is_escape=False, now=at)
+    return fuse
+
+
 def test_only_moves_of_the_last_minute_are_remembered_also_where_nobody_judges() -> None:
     """An edge learns of moves for weeks, and asks for no count of them."""
     fuse = Fuse()
@@ -25,9 +33,7 @@ def test_only_moves_of_the_last_minute_are_remembered_also_where_nobody_judges()
 
 
 def test_planned_moves_are_capped_per_minute_and_escapes_are_not_by_that_cap() -> None:
-    fuse, judge = Fuse(), Judge(spec=SPEC)
-    for at in (100.0, 110.0):
-        fuse.note_move(is_escape=False, now=at)
+    fuse, judge = blown(), Judge(spec=SPEC)
     joint = standing(edge1=0.2, edge2=0.9)
     capped = judge.judge(joint, OWNED, escape=None, is_called=True, now=120.0, fuse=fuse)
     assert capped.outcome is Outcome.WAIT
@@ -39,9 +45,7 @@ def test_planned_moves_are_capped_per_minute_and_escapes_are_not_by_that_cap() -
 
 
 def test_the_cap_is_no_matter_where_nobody_wants_to_move() -> None:
-    fuse, judge = Fuse(), Judge(spec=SPEC)
-    for at in (100.0, 110.0):
-        fuse.note_move(is_escape=False, now=at)
+    fuse, judge = blown(), Judge(spec=SPEC)
     joint = standing(edge1=0.9, edge2=0.2)
     stays = judge.judge(joint, OWNED, escape=None, is_called=True, now=120.0, fuse=fuse)
     assert (stays.outcome, "last minute" in stays.reason) == (Outcome.STAY, False)
