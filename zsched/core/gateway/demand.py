@@ -113,23 +113,25 @@ class Demands:
 
         1 where nothing shows that it lacks anything, and where its use still rises.
         """
-        known, load = self._known.get(task, _Known()), profile.worker(task)
-        if known.owner != profile.node or not known.work or now - known.since < SETTLE_S:
+        load, work = self._settled(task, profile, now), self._known.get(task, _Known()).work
+        if not work or load is None or load.cpu_cores is None or not (shows_lack(load) and is_short(load)):
             return 1.0
-        if load is None or load.cpu_cores is None or not (shows_lack(load) and is_short(load)):
-            return 1.0
-        return min(load.cpu_cores * speed_of(profile) / known.work, 1.0)
+        return min(load.cpu_cores * speed_of(profile) / work, 1.0)
 
     def seen_s(self, task: TaskId, profile: Profile, now: float) -> float:
         """How long a task's jobs are seen to take on a full machine where it is; 0 elsewhere, and just after it came.
 
         Where a load has ended the jobs that it held up count in their mean for some seconds.
         """
-        known, load = self._known.get(task, _Known()), profile.worker(task)
-        jobs = None if load is None else load.jobs
-        if jobs is None or known.owner != profile.node or now - known.since < SETTLE_S or not is_full(profile):
+        load = self._settled(task, profile, now)
+        if load is None or load.jobs is None or not is_full(profile):
             return 0.0
-        return jobs.time_s if jobs.age_s is None else jobs.age_s
+        return load.jobs.time_s if load.jobs.age_s is None else load.jobs.age_s
+
+    def _settled(self, task: TaskId, profile: Profile, now: float) -> WorkerLoad | None:
+        """The task's worker where its use has risen since it came; ``None``: elsewhere, or it still rises."""
+        known = self._known.get(task, _Known())
+        return profile.worker(task) if known.owner == profile.node and now - known.since >= SETTLE_S else None
 
     def note_unplaced(self, task: TaskId) -> None:
         """Nobody has the task: who gets it next will not show it at once."""

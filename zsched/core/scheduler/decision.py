@@ -32,10 +32,6 @@ class Decided(Struct, frozen=True, kw_only=True):
     """Why the owner is to be left, by an escape or by an operator's drain."""
     needed: int
     """How many robots' utilities this decision needs."""
-    expected: Mapping[NodeId, float]
-    """{who can have the task: seconds of work that it owes, with what it will lose}."""
-    given: Mapping[NodeId, float]
-    """{candidate: what it is worth by what it has kept (`zsched.core.scheduler.kept`)}."""
     takes_turns: bool = False
     """It waits for other tasks' moves: a planned one, or a flight from short memory."""
     is_waiting_its_turn: bool = False
@@ -99,8 +95,6 @@ def decide_by(compared: Standing, judge: Judge, fuse: Fuse, figures: Figures) ->
         escape=escape,
         leaving=escape or (f"{allocation.owner} is {figures.drained}" if figures.drained else None),
         needed=needed,
-        expected=judge.ledger.expected({name: 1.0 - one for name, one in judgement.aggregates.items()}),
-        given=judge.kept.corrected(standing.aggregates, allocation.owner, judge.spec.memory_s, figures.now),
         takes_turns=takes_turns,
         is_waiting_its_turn=is_waiting,
     )

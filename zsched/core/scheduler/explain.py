@@ -15,6 +15,7 @@ from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.eligibility import is_for_comers
 from zsched.core.scheduler.fuse import WINDOW_S, Fuse
 from zsched.core.scheduler.judge import Outcome
+from zsched.core.scheduler.kept import Kept
 from zsched.core.scheduler.standing import RESOLUTION, Standing, counted, mean_of, pick, rounded
 from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Figures, Verdict
@@ -216,23 +217,24 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
     figures, standing = decision.figures, again.standing
     owner, tuning = figures.allocation.owner, figures.allocation.tuning
     needs = {need.candidate: need for need in decision.needs}
+    kept = Kept.of(replace(figures.judge.kept, owner=owner))
+    unkept = kept.unkept(standing.aggregates, figures.rules.memory_s, figures.now)
     found = []
     for name in figures.rules.candidates:
         is_left = name == owner and again.leaving is not None
         joint = standing.aggregates.get(name)
         bonus = tuning.bonus if name == owner and not is_left else 0.0
         need = needs.get(name)
-        unkept = 0.0 if joint is None else joint - again.given[name]
         is_out = joint is None or is_left
         found.append(
             CandidateSum(
                 node=name,
                 is_owner=name == owner,
                 joint=joint,
-                unkept=unkept,
+                unkept=unkept.get(name, 0.0),
                 bonus=bonus,
-                total=None if is_out or joint is None else joint - unkept + bonus,
-                owed_s=again.expected.get(name),
+                total=None if is_out or joint is None else joint - unkept.get(name, 0.0) + bonus,
+                owed_s=again.judgement.owed.get(name),
                 why_not=again.leaving or "" if is_left else standing.vetoed.get(name, ""),
                 need_cpu_cores=None if need is None else need.cpu_cores,
                 need_memory_mb=None if need is None else need.memory_mb,
@@ -320,7 +322,7 @@ def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[C
 
 def _times(figures: Figures, again: Decided, node: NodeId, owner: NodeId) -> Iterator[str]:
     """What ``node``, which owes less than the ``owner``, still waits for."""
-    more_s, price_s = again.expected[owner] - again.expected[node], figures.rules.price_s
+    more_s, price_s = again.judgement.owed[owner] - again.judgement.owed[node], figures.rules.price_s
     yield f"{owner} owes {more_s:.2f} s more than {node}, and must go on losing:"
     if more_s < price_s:
         yield f"until that is the price of a move, {price_s:g} s"

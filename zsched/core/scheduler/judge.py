@@ -19,7 +19,7 @@ from zsched.core.absence import Absences
 from zsched.core.scheduler.fuse import ESCAPES_PER_MINUTE, WINDOW_S, Fuse
 from zsched.core.scheduler.kept import Kept
 from zsched.core.scheduler.ledger import Ledger
-from zsched.core.scheduler.standing import LOST_S, Standing, rounded
+from zsched.core.scheduler.standing import LOST_S, Standing, pick
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
@@ -60,6 +60,8 @@ class Judgement(Struct, frozen=True, kw_only=True):
     is_escape: bool = False
     aggregates: Mapping[NodeId, float] = field(default_factory=dict)
     """With the owner's bonus."""
+    owed: Mapping[NodeId, float] = field(default_factory=dict)
+    """{who can have the task: seconds of work that it owes, with what it will lose}."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -189,7 +191,9 @@ class Judge:
         self._watch_home(home in scored and home != owner, now)
         owed = self._charge(worth, owner, now)
         expected = {name: owed[name] for name in scored}
-        winner = home if home is not None and home in scored else least_of(expected, owner)
+        winner = (
+            home if home is not None and home in scored else pick({name: -one for name, one in expected.items()}, owner)
+        )
         if winner is None:
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
@@ -208,6 +212,7 @@ class Judge:
             reason=reason,
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
+            owed=expected,
         )
 
     def _watch_home(self, is_fit: bool, now: float) -> None:
@@ -291,11 +296,6 @@ class Judge:
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} is worth most"
-
-
-def least_of(expected: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
-    """Who owes least, to 1/1024 s; of several the owner, then the lowest name."""
-    return min(expected, key=lambda name: (rounded(expected[name]), name != owner, name), default=None)
 
 
 def _nobody(allocation: Allocation, why: str) -> str:

@@ -80,7 +80,7 @@ class Kept(Struct):
     def fail(self, node: NodeId, now: float) -> None:
         """The machine was left because it failed: it gave half of what it promised, or half of what it gave before."""
         if node in self.foretold:
-            promised, gave, _ = self.seen.get(node, (self.foretold[node],) * 2 + (now,))
+            promised, gave, _ = self.seen.get(node, (self.foretold[node], self.foretold[node], now))
             self.seen[node] = (promised, min(gave, promised) / 2.0, now)
 
     def unkept(self, worth: Mapping[NodeId, float], memory_s: float, now: float) -> dict[NodeId, float]:

@@ -481,7 +481,6 @@ class Rounds:
     def forgive(self, name: TaskId, node: NodeId, now: float) -> None:
         """An operator has mended what was held against a node; judge again at once."""
         self.tasks[name].judge.kept.seen.pop(node, None)
-        self._answer = (-1, -math.inf, None, self._answer[-1])  # it tells of what is forgotten now
         self.hurry(now)
 
     def on_learnt(self, name: TaskId, *, is_new_epoch: bool, now: float, tuning: Tuning | None = None) -> None:
