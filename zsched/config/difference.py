@@ -129,7 +129,7 @@ def warnings_in_force(text: str, warnings: tuple[Fault, ...]) -> tuple[Fault, ..
 
     Where it names no electors, those that are agreed stay, and what the file's default would be is moot.
     """
-    return warnings if names_electors(text) else tuple(one for one in warnings if "elector" not in one.message)
+    return warnings if names_electors(text) else tuple(one for one in warnings if not one.is_of_electors)
 
 
 def wanted_electors(agreed: Sequence[NodeId], new: Fleet, text: str) -> tuple[NodeId, ...]:

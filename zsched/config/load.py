@@ -247,17 +247,15 @@ def _electors(section: Section, cast: Cast, out: Collector) -> tuple[NodeId, ...
 
 
 def _advise_electors(electors: tuple[NodeId, ...], cast: Cast, place: Place, out: Collector) -> None:
-    spare = [name for name in cast.names if name not in electors]
-    three = (*electors, *spare[: 3 - len(electors)])
+    spare, count = [name for name in cast.names if name not in electors], len(electors)
+    three = (*electors, *spare[: 3 - count])
     hint = f"electorate: [{', '.join(sorted(three))}]" if len(three) == 3 else ""  # two would be no better than one
-    if len(electors) == 1:
-        out.warn(place, f"{electors[0]!r} is the only elector: while it is away no task can move", hint)
-    elif len(electors) == 2:
-        out.warn(place, "two electors: while either is away no task can move", hint)
-    elif len(electors) % 2 == 0:
-        count = len(electors)
+    if count <= 2:
+        away = f"{electors[0]!r} is the only elector: while it" if count == 1 else "two electors: while either"
+        out.warn(place, f"{away} is away no task can move", hint, is_of_electors=True)
+    elif count % 2 == 0:
         message = f"{count} electors survive the loss of {(count - 1) // 2}, as {count - 1} would"
-        out.warn(place, message, "an odd number is better")
+        out.warn(place, message, "an odd number is better", is_of_electors=True)
 
 
 # --- zenoh -----------------------------------------------------------------------------------------------------------

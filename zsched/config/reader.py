@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 from typing import Final, TypeAlias
 
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 from zsched.screen import printable
 
 MAX_FILE_BYTES: Final = 256 << 10
@@ -62,6 +62,8 @@ class Fault(Struct, frozen=True, kw_only=True):
     width: int = 1
     file: str = ""
     """As `Place.file`."""
+    is_of_electors: bool = False
+    """A warning of how many electors the file has, or would have by default."""
 
     def render(self, file: str, severity: str = "error") -> str:
         """The fault as a compiler shows it: place, message, the line, a caret, the hint."""
@@ -95,9 +97,9 @@ class Collector:
         """The file cannot be used."""
         self._faults.append(self._fault(place, message, hint))
 
-    def warn(self, place: Place, message: str, hint: str = "") -> None:
+    def warn(self, place: Place, message: str, hint: str = "", *, is_of_electors: bool = False) -> None:
         """The file can be used, but an operator should know."""
-        self._warnings.append(self._fault(place, message, hint))
+        self._warnings.append(replace(self._fault(place, message, hint), is_of_electors=is_of_electors))
 
     @property
     def count(self) -> int:
@@ -116,8 +118,7 @@ class Collector:
 
     def _fault(self, place: Place, message: str, hint: str) -> Fault:
         lines = self._lines[place.file]
-        source = lines[place.line - 1] if 0 < place.line <= len(lines) else ""
-        source = printable(source)
+        source = printable(lines[place.line - 1] if 0 < place.line <= len(lines) else "")
         width = max(1, min(place.width, len(source) - place.col + 1))
         line, col, file = place.line, place.col, place.file
         return Fault(line=line, col=col, message=message, hint=hint, source_line=source, width=width, file=file)

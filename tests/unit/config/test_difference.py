@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors
+from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors, warnings_in_force
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Cell, Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
@@ -456,3 +456,12 @@ def test_a_node_that_comes_at_the_end_of_the_seeds_dials_and_nobody_else_does_an
     assert told("r1, r2, r4, r3") == "r3 dials the others"
     for seeds in ("r1, r2, r3, r4", "r3, r1, r2, r4", "r2, r1, r4, r3"):
         assert told(seeds) == "every daemon dials them from its next start on"
+
+
+def test_which_warnings_are_moot_hangs_on_no_word() -> None:
+    """Where a document names no electors, those of its default number are; others may speak of electors as well."""
+    text = "fleet: hall\nnodes:\n  r1: {kind: robot}\ntasks: {}\n"
+    (few,) = (one for one in check_bytes(text.encode(), "f").warnings if one.is_of_electors)
+    reworded, other = replace(few, message="this fleet is small"), replace(few, is_of_electors=False)
+    assert warnings_in_force(text, (reworded, other)) == (other,)
+    assert warnings_in_force(f"{text}electorate: [r1]\n", (reworded, other)) == (reworded, other)
