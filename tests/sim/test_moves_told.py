@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.handlers.work import _move_of
-from zsched.core.register.register import FROM_A_PEER
+from zsched.core.handlers.work import FROM_A_PEER, _move_of
 from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim.simulator import Simulator
 
@@ -39,4 +38,4 @@ def test_votes_of_another_revision_are_no_votes_for_a_move() -> None:
     assert proposal.base_revision == value.revision
     for ahead, votes in ((1, ((voter, proposal.candidate),)), (2, ())):
         learnt = replace(value, revision=value.revision + ahead, epoch=1, owner=proposal.candidate)
-        assert _move_of(node, learnt, FROM_A_PEER, is_known=False).votes[:1] == votes
+        assert _move_of(node, learnt, None, is_known=False).votes[:1] == votes

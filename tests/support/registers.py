@@ -78,7 +78,7 @@ class Step:
     prepare: Prepare | None = None
     accept: Accept | None = None
     learnt: Allocation | None = None
-    reason: str = ""
+    reason: str | None = ""
     """Why what was learnt is what it is."""
     ends: tuple[tuple[Change, RoundOutcome], ...] = ()
     problem: str = ""

@@ -50,8 +50,8 @@ class ToDo(Struct):
     """Tasks whose vote has ended with: stay."""
     ended: list[Ended] = field(default_factory=list)
     """Changes of this node's that were committed, overtaken or given up."""
-    learnt: list[tuple[Allocation, str]] = field(default_factory=list)
-    """(a newer value, why it came about)."""
+    learnt: list[tuple[Allocation, str | None]] = field(default_factory=list)
+    """(a newer value, why it came about; ``None``: another node committed it)."""
     send: list[do.Instruction] = field(default_factory=list)
     """Instructions whose effect other nodes, or an asking operator, will see."""
     apply: list[do.Instruction] = field(default_factory=list)

@@ -21,11 +21,10 @@ from zsched.core import instructions as do
 from zsched.core.electorate.strangers import SHOWN_S
 from zsched.core.executor.handover import HEARS_S
 from zsched.core.executor.sparing import Sparing
-from zsched.core.handlers.work import carry_out
+from zsched.core.handlers.work import FROM_A_PEER, carry_out
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
-from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import OWN_FILE
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.register.register import FROM_A_PEER
 from zsched.core.stages import UNREADY_SHOWN_S, Handler, PastValue, Stages, Unready
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
@@ -22,24 +21,34 @@ from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.words import CREATION_STEP, HAS_RESTED, TOO_FEW_ELECTORS, shown
 
+FROM_A_PEER: Final = "learnt from a peer"
+"""Why a value came about that another node committed, as far as is known here."""
 FIRST_NEWS: Final = "known from a peer, the first news here"
 """Why a task has its owner, at a node that knew nothing of the task."""
 
 # --- learnt values ---------------------------------------------------------------------------------------------------
 
 
-def carry_out(node: Stages, value: Allocation, reason: str, todo: ToDo, now: float, *, is_known: bool = False) -> None:
+def carry_out(
+    node: Stages, value: Allocation, why: str | None, todo: ToDo, now: float, *, is_known: bool = False
+) -> None:
     """Carry out a newly learnt value; this batch writes it to disk before anything else.
 
-    ``is_known``: the value was there before this node's executor was, so it is no change of owner.
+    Args:
+        node: the stages.
+        value: the value.
+        why: it came about; ``None``: by another node's change.
+        todo: takes what is to be done.
+        now: monotonic seconds.
+        is_known: the value was there before this node's executor was, so it is no change of owner.
     """
     task, executor = value.task, node.executors[value.task]
-    is_new_epoch, is_ours = value.epoch > executor.epoch, reason != FROM_A_PEER
-    if _is_first_news(executor.epoch, value, reason):
-        is_known, reason = True, FIRST_NEWS
+    is_new_epoch, is_ours = value.epoch > executor.epoch, why is not None
+    if not is_ours and _is_first_news(executor.epoch, value):
+        is_known, why = True, FIRST_NEWS
     is_by_order = value.asked is not None and (is_ours or _has_only_moved(node, value))
-    move = _move_of(node, value, reason, is_known=is_known) if is_new_epoch and value.owner is not None else None
-    reason = _reason_of(node, value, reason, is_new_epoch=is_new_epoch) if move is None else move.reason
+    move = _move_of(node, value, why, is_known=is_known) if is_new_epoch and value.owner is not None else None
+    reason = _reason_of(node, value, why, is_new_epoch=is_new_epoch) if move is None else move.reason
     node.history[task].append(PastValue(value=value, at=now, reason=reason))
     if is_new_epoch:
         left = executor.owner
@@ -105,15 +114,15 @@ def _remembers(node: Stages, name: NodeId) -> bool:
     return is_there and (name not in node.stateless or name in node.disks.refusals())
 
 
-def _is_first_news(epoch: int, value: Allocation, reason: str) -> bool:
+def _is_first_news(epoch: int, value: Allocation) -> bool:
     """Whether a peer tells of an owner to a node that knew nothing of the task, and that owner is not the first one.
 
     The first placement is a move for everybody: nobody had the task before.
     """
-    return epoch == 0 and reason == FROM_A_PEER and value.owner is not None and value.epoch % CREATION_STEP > 1
+    return epoch == 0 and value.owner is not None and value.epoch % CREATION_STEP > 1
 
 
-def _move_of(node: Stages, value: Allocation, reason: str, *, is_known: bool) -> Move:
+def _move_of(node: Stages, value: Allocation, why: str | None, *, is_known: bool) -> Move:
     """A change of owner, with the votes for it as far as this node has heard them.
 
     A robot that did not commit it itself tells the reason of one that wanted it.
@@ -125,7 +134,7 @@ def _move_of(node: Stages, value: Allocation, reason: str, *, is_known: bool) ->
         revision=value.revision,
         left=node.executors[value.task].owner,
         owner=value.owner,
-        reason=wanted[0] if wanted and reason == FROM_A_PEER else _reason_of(node, value, reason, is_new_epoch=True),
+        reason=wanted[0] if wanted and why is None else _reason_of(node, value, why, is_new_epoch=True),
         votes=tuple((proposal.voter, proposal.candidate) for proposal in votes),
         is_known=is_known,
     )
@@ -144,16 +153,16 @@ def _has_only_moved(node: Stages, value: Allocation) -> bool:
     return value.revision - revision == value.epoch - epoch > 0
 
 
-def _reason_of(node: Stages, value: Allocation, reason: str, *, is_new_epoch: bool) -> str:
+def _reason_of(node: Stages, value: Allocation, why: str | None, *, is_new_epoch: bool) -> str:
     """Why the value is what it is; a node that did not commit an operator's order tells it from the value.
 
     Who has missed a revision does not know whether the order is the one that has moved the task.
     """
-    if value.asked is None or reason != FROM_A_PEER:
-        return reason
+    if value.asked is None or why is not None:
+        return FROM_A_PEER if why is None else why
     who = told_by(value.asked)
     if is_new_epoch:
-        return f"moved by {who}" if _has_only_moved(node, value) else reason
+        return f"moved by {who}" if _has_only_moved(node, value) else FROM_A_PEER
     if value.pause is not None and value.pause.revision == value.revision:
         return f"paused by {who}"
     if value.pin is not None and value.pin.revision == value.revision:

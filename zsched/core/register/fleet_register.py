@@ -58,7 +58,7 @@ class FleetRegister(Register[FleetValue]):
         ask = AskElectors(to=self._count.names, question=question, deadline_s=self._ballot_s, may_join=may_join)
         todo.fleet.append(ask)
 
-    def _hand_on(self, value: FleetValue, why: str, todo: ToDo) -> None:
+    def _hand_on(self, value: FleetValue, why: str | None, todo: ToDo) -> None:
         """The roll looks for it itself, at once: nothing may be answered before its registers count by it."""
 
     def _end(self, change: Rewrite[FleetValue], outcome: RoundOutcome, todo: ToDo) -> None:

@@ -37,8 +37,6 @@ from zsched.core.values.struct import Struct, field, replace
 from zsched.core.values.words import shown
 
 BACKOFF_CAP_S = 5.0
-FROM_A_PEER = "learnt from a peer"
-"""Why a value came about that another node committed."""
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
 ROUND_BALLOTS = 6
@@ -220,8 +218,8 @@ class Register(ABC, Generic[V]):
         """Send a question to every elector; answers are late after ``ballot_s``."""
 
     @abstractmethod
-    def _hand_on(self, value: V, why: str, todo: ToDo) -> None:
-        """A newer value is learnt."""
+    def _hand_on(self, value: V, why: str | None, todo: ToDo) -> None:
+        """A newer value is learnt; ``why``: of our own change, ``None``: of another node's."""
 
     @abstractmethod
     def _end(self, change: Rewrite[V], outcome: RoundOutcome, todo: ToDo) -> None:
@@ -352,10 +350,10 @@ class Register(ABC, Generic[V]):
         if outcome is not None:
             self._finish(todo, outcome, now)
 
-    def _why(self, outcome: RoundOutcome | None) -> str:
-        """Why a learnt value came about: by our own change, or by another node's."""
+    def _why(self, outcome: RoundOutcome | None) -> str | None:
+        """Why a learnt value came about, if by our own change; ``None``: by another node's."""
         change = None if self._round is None else self._round.change
-        return FROM_A_PEER if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
+        return None if change is None or outcome is not RoundOutcome.COMMITTED else change.reason
 
     def _outcome_by(self, value: V) -> RoundOutcome | None:
         """The end of our change under way, given the learnt ``value``; ``None``: it goes on."""

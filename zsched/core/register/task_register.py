@@ -47,7 +47,7 @@ class TaskRegister(Register[Allocation]):
         else:
             todo.add(SendAccept(accept=question, deadline_s=self._ballot_s, may_join=self._may_join))
 
-    def _hand_on(self, value: Allocation, why: str, todo: ToDo) -> None:
+    def _hand_on(self, value: Allocation, why: str | None, todo: ToDo) -> None:
         todo.learnt.append((value, why))
 
     def _end(self, change: Rewrite[Allocation], outcome: RoundOutcome, todo: ToDo) -> None:

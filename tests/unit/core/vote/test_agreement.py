@@ -239,7 +239,7 @@ def test_values_of_several_tasks_are_learnt_from_one_message() -> None:
     )
     effects = agreed(agreement.on_learnt, answer(both), 100.0)
     assert [one.task for one, _ in effects.learnt] == ["merge", "plan"]
-    assert {reason for _, reason in effects.learnt} == {"learnt from a peer"}
+    assert {reason for _, reason in effects.learnt} == {None}
     assert agreement.counters == {"learnt_foreign": 1}
     assert agreed(agreement.on_learnt, answer(replace(both, node="robot1")), 100.0) == ToDo(), "our own"
     assert agreed(agreement.on_learnt, answer(replace(both, node="stranger")), 100.0) == ToDo()
