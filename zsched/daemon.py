@@ -43,6 +43,7 @@ from zsched.core.status import status_line
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet, WorkerLink, electorate_hash, fleet_hash
 from zsched.core.values.model import NodeId, NodeKind
+from zsched.core.values.problems import Problem
 from zsched.core.values.snapshot import Exposure
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError, ConfigError, NameTakenError
@@ -212,12 +213,11 @@ class Daemon:
         if restored.is_unsaved:
             node.agreement.on_persist_failed(restored.problem or "")
         elif restored.problem is not None:
-            node.problems["state"] = restored.problem
+            node.set_problem(Problem.STATE, restored.problem)
         if self._memory_objection:
             log.warning("shared_memory off why=%s", self._memory_objection)
-            node.problems["shared_memory"] = f"shared memory is off here: {self._memory_objection}"
-        if plain_text := daemon_tls.plain_text_problem(self._spec, self._protocol):
-            node.problems["tls"] = plain_text
+            node.set_problem("shared_memory", f"shared memory is off here: {self._memory_objection}")
+        node.set_problem("tls", daemon_tls.plain_text_problem(self._spec, self._protocol) or None)
         node.security = self._exposure(points)
         return node
 

@@ -178,10 +178,10 @@ def test_an_owner_s_worker_stops_at_once_and_the_task_goes_to_a_node_whose_clock
     sim.run(0.1)
     assert working(sim) == ""
     assert sim.machines[owner].roles["guard"].role is WorkerRole.IDLE
-    assert "slewed" in sim.node(owner).problems["clock"]
+    assert "slewed" in sim.node(owner).problems["clock", ""]
     assert sim.run_until(lambda: working(sim) not in ("", owner), 10.0)
     sim.run(25.0)
-    assert "clock" not in sim.node(owner).problems
+    assert ("clock", "") not in sim.node(owner).problems
     assert sim.unsettled() == ""
 
 
@@ -228,13 +228,13 @@ def test_an_owner_that_wakes_from_sleep_stops_and_begins_again_like_one_that_has
     sim, owner = started("edge1", "edge2")
     sim.suspend(sim.machines[owner], slept_s, error_s)
     sim.run(slept_s + 1.5 * LOOK_S)
-    assert f"jumped by {slept_s + error_s:+.3f} s" in sim.node(owner).problems["clock"]
+    assert f"jumped by {slept_s + error_s:+.3f} s" in sim.node(owner).problems["clock", ""]
     assert sim.machines[owner].roles["guard"].role is WorkerRole.IDLE
     assert working(sim) != owner
     sim.run(DOUBT_S - LOOK_S)
-    assert "jumped" in sim.node(owner).problems["clock"], "and it is no slew to anybody who looks a little later"
+    assert "jumped" in sim.node(owner).problems["clock", ""], "and it is no slew to anybody who looks a little later"
     sim.run(10.0)
-    assert "clock" not in sim.node(owner).problems
+    assert ("clock", "") not in sim.node(owner).problems
     assert working(sim) != "", "somebody works"
 
 
@@ -242,7 +242,7 @@ def test_an_elector_that_wakes_from_sleep_grants_nothing_for_a_while() -> None:
     sim, owner = started("edge1", "edge2")
     sim.suspend(sim.machines[ROBOTS[0]], 3.0, 0.5)
     sim.run(3.0 + 1.5 * LOOK_S)
-    assert sim.node(ROBOTS[0]).problems["clock"]
+    assert sim.node(ROBOTS[0]).problems["clock", ""]
     for _ in range(60):
         sim.run(0.1)
         assert working(sim) == owner, "the others' grants are enough"
@@ -301,7 +301,7 @@ def test_tasks_that_are_not_exclusive_do_not_mind() -> None:
     sim.run(5.0)
     assert sim.agreed("guard") == owner
     assert sim.node(owner).worker_states["guard"] is WorkerState.READY
-    assert "clock" not in sim.node(owner).problems
+    assert ("clock", "") not in sim.node(owner).problems
 
 
 def test_a_doubt_is_no_problem_any_more_where_nothing_is_exclusive_any_more() -> None:
@@ -310,12 +310,12 @@ def test_a_doubt_is_no_problem_any_more_where_nothing_is_exclusive_any_more() ->
     robot = ROBOTS[0]
     slewed(sim, robot, 8.0)
     sim.run(1.0)
-    assert "slewed" in sim.node(robot).problems["clock"]
+    assert "slewed" in sim.node(robot).problems["clock", ""]
     shared = replace(sim.fleet, tasks=(replace(*sim.fleet.tasks, exclusive=False),))
     for machine in sim.machines.values():
         machine.fleet = shared
         sim.reload(machine)
-    assert sim.run_until(lambda: "clock" not in sim.node(robot).problems, 5.0), "its clock is still slewed"
+    assert sim.run_until(lambda: ("clock", "") not in sim.node(robot).problems, 5.0), "its clock is still slewed"
     leases = sim.node(robot).agreement.leases
     assert leases.is_in_doubt
     assert sim.run_until(lambda: not leases.is_in_doubt, 8.0 + DOUBT_S), "it told the others so for ever"

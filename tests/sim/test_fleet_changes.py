@@ -101,9 +101,9 @@ def test_a_node_starts_by_its_document_and_shows_that_its_file_differs() -> None
     play.sim.crash("robot1")
     play.sim.start("robot1")
     assert play.sim.node("robot1").fleet.relay_orphan_s == FLEET.relay_orphan_s
-    assert "zsched apply" in play.sim.node("robot1").problems["fleet/file"]
+    assert "zsched apply" in play.sim.node("robot1").problems["fleet/file", ""]
     play.settle(20)
-    assert "fleet/file" not in play.sim.node("robot2").problems
+    assert ("fleet/file", "") not in play.sim.node("robot2").problems
 
 
 @pytest.mark.parametrize("kept", [0, 1], ids=["all files are gone", "an older folder"])
@@ -122,9 +122,9 @@ def test_a_node_whose_document_is_gone_starts_with_what_it_knows_and_fetches_it(
     play.sim.start("robot1")
     robot = play.sim.node("robot1")
     assert [task.name for task in robot.fleet.tasks] == [TASK]
-    assert "is not on this disk" in robot.agreement.problems["fleet/document"]
+    assert "is not on this disk" in robot.agreement.problems["fleet/document", ""]
     assert play.sim.run_until(lambda: play.sim.node("robot1").fleet.tasks == agreed.tasks, 5)
-    assert "fleet/document" not in play.sim.node("robot1").agreement.problems
+    assert ("fleet/document", "") not in play.sim.node("robot1").agreement.problems
     play.settle(20)
 
 
@@ -134,7 +134,7 @@ def test_a_document_that_is_not_valid_here_is_shown_and_the_node_goes_on_by_its_
     document = play.document(replace(FLEET, relay_orphan_s=5.0))
     play.sim.documents.unfit.add(("robot3", next(reversed(play.sim.documents.says))))
     assert play.told("robot1", ChangeFleet(document=document)).outcome is CommandOutcome.OK
-    assert play.sim.run_until(lambda: "fleet/document" in play.sim.node("robot3").agreement.problems, 5)
+    assert play.sim.run_until(lambda: ("fleet/document", "") in play.sim.node("robot3").agreement.problems, 5)
     assert play.sim.node("robot3").fleet.relay_orphan_s == FLEET.relay_orphan_s
     assert play.sim.run_until(lambda: play.sim.node("robot2").fleet.relay_orphan_s == 5.0, 5)
     assert play.sim.node("robot3").agreement.counters["document_refused"] == 1

@@ -97,7 +97,7 @@ def test_an_elector_that_has_lost_its_disk_is_replaced_and_the_log_says_why() ->
     machine = play.sim.machines["edge2"]
     play.sim.initialise(machine)
     play.sim.start("edge2")
-    assert play.sim.run_until(lambda: "state" in play.sim.node("edge2").agreement.problems, REPLACE_S)
+    assert play.sim.run_until(lambda: ("state", "") in play.sim.node("edge2").agreement.problems, REPLACE_S)
     play.reaches(("edge1", "edge3", "robot1"))
     assert play.sim.run_until(lambda: not play.sim.node("edge2").agreement.problems, 5), "that seat is gone"
     play.sim.crash("edge3")
@@ -149,7 +149,7 @@ def test_a_lost_disk_among_three_electors_without_a_spare_heals_by_itself(how: s
             machine.disk.restore(Random(1))
         machine.is_durable = False
     play.sim.start("robot3")
-    assert play.sim.run_until(lambda: "state" in play.sim.node("robot3").agreement.problems, 5)
+    assert play.sim.run_until(lambda: ("state", "") in play.sim.node("robot3").agreement.problems, 5)
     assert not play.sim.node("robot3").agreement.is_elector
     play.reaches(("robot1", "robot2"))
     assert play.sim.run_until(lambda: not play.sim.node("robot3").agreement.problems, 5), "that seat is gone"

@@ -20,16 +20,7 @@ from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, check_dangers, check_reason, say, warn
-from zsched.commands.document import (
-    QUESTION,
-    UNKNOWING,
-    InForce,
-    ask_all,
-    change,
-    document_text,
-    in_force,
-    ordered,
-)
+from zsched.commands.document import QUESTION, UNKNOWING, InForce, ask_all, change, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.flags import (
     LEAVE,
@@ -51,8 +42,8 @@ from zsched.config.editing import remove_node
 from zsched.config.load import check_bytes
 from zsched.core.electorate.pilot import may_go
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.problems import Problem, of_kind
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import TAKEN_OUT
 from zsched.errors import AdapterError, ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime.membership import Places, Written, belongings, check_ended, is_out, note_out, put_away, whose
@@ -240,7 +231,7 @@ def authority_danger(order: LeaveOrder, fleet: str, text: str = "") -> tuple[tup
 def _take_leave(way: Way, status: Json) -> int:
     """Have the fleet agree, step by step; the exit code."""
     order, me = way.order, way.me
-    if any(TAKEN_OUT in str(problem) for problem in status["problems"]):  # the others may not answer it any more
+    if of_kind(status, Problem.TAKEN_OUT):  # the others may not answer it any more
         way.tell(f"{me} is no node of {status['fleet']} any more: it was taken out")
         return _go_alone(way, str(status["fleet"]), int(status["fleet_revision"]) + 1)
     held = _newest(way, status)

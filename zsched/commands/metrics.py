@@ -20,7 +20,7 @@ from typing import Final
 from zsched.commands.ask import ask_door, find_door
 from zsched.commands.common import CliError, Json, uninterrupted
 from zsched.commands.report import all_problems, degradations
-from zsched.core.values.words import NO_SPARE
+from zsched.core.values.problems import Problem, of_kind
 from zsched.errors import ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK
 
@@ -116,7 +116,8 @@ def _of_tasks(tasks: list[Json]) -> Iterator[Family]:
         yield f"zsched_task_{key}", "gauge", text, [({"task": task["name"]}, task[key]) for task in tasks]
     ages = [({"task": task["name"]}, task["since_s"]) for task in tasks if task["since_s"] is not None]
     yield "zsched_task_owner_known_seconds", "gauge", "Since this node learnt of the owner.", ages
-    alone = [({"task": t["name"]}, any(text.startswith(NO_SPARE) for text in t["problems"])) for t in tasks]
+    # An older daemon tells no kinds.
+    alone = [({"task": t["name"]}, bool(of_kind(t, Problem.NO_SPARE))) for t in tasks if "problem_kinds" in t]
     yield "zsched_task_without_spare", "gauge", "No other living candidate could take it over.", alone
     joint = [
         (t["name"], name, value) for t in tasks if t["decision"] for name, value in t["decision"]["aggregates"].items()

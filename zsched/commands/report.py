@@ -25,15 +25,8 @@ from zsched.commands.page import (
 )
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
-from zsched.core.values.words import (
-    COUNTED_ANEW,
-    NEVER_INITIALISED,
-    RESTARTING,
-    WAS_READY,
-    has_lost_its_worker,
-    shown,
-    told_of_worker,
-)
+from zsched.core.values.problems import Problem, of_kind
+from zsched.core.values.words import COUNTED_ANEW, RESTARTING, WAS_READY, has_lost_its_worker, shown, told_of_worker
 
 Json = dict[str, Any]
 
@@ -46,8 +39,6 @@ MOST, LITTLE = 0.98, 0.8
 """From here on nearly all jobs are done; below that, many are not."""
 JOBS_OVER_S = 10.0
 """What a profile says of jobs that is so old is history, too."""
-CAUSES = (NEVER_INITIALISED, "nothing can be agreed")
-"""How the problems begin from which others follow: they come first."""
 WORDS_OF_SECURITY = {"secured": "secured", "encrypted": "TLS", "open": "NOT SECURED"}
 """What the first line says of a node's sessions; of one that only its own machine reaches nothing."""
 NO_ANSWER_TO = 100
@@ -604,10 +595,10 @@ def _unanswered(task: Json) -> list[str]:
 
 def all_problems(status: Json) -> list[str]:
     """What is wrong, causes first."""
-    causes = [problem for problem in status["problems"] if problem.startswith(CAUSES)]
-    said = status["problems"]
-    short = [one for one in degradations(status) if not any(text.startswith(f"{one};") for text in said)]
-    found = [*causes, *short, *said]
+    lacks = of_kind(status, Problem.NO_QUORUM)
+    causes = [*of_kind(status, Problem.NEVER_INITIALISED, Problem.NOTHING_AGREED), *lacks]
+    # That one is the first of why the fleet is degraded, in the daemon's words.
+    found = [*causes, *degradations(status)[len(lacks) :], *status["problems"]]
     found += [f"{task['name']}: {problem}" for task in status["tasks"] for problem in task["problems"]]
     return list(dict.fromkeys(found))
 

@@ -207,6 +207,8 @@ class DocumentRefused(Struct, frozen=True, kw_only=True):
     """Of `StoreDocument`; ``None``: it was fetched from a peer."""
     is_of_disk: bool = False
     """It may be valid here: the disk refused it, and may take it another time."""
+    is_taken_out: bool = False
+    """It does not name this node."""
 
 
 # --- membership ------------------------------------------------------------------------------------------------------

@@ -53,6 +53,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
 from zsched.core.values.plan import StreamCount, WorkerRole
+from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import CLOCK_IN_DOUBT, RESTS
@@ -62,8 +63,6 @@ from zsched.core.vote.expiry import Expiry
 from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.voting import Votes
 
-OWN_FILE: Final = "fleet/file"
-"""The problem that this machine's file differs from the agreed document, which it may for good."""
 LAG_SHOWN_S: Final = 30.0
 """A delay of the loop is shown for so long: who looks at the status never comes in the moment of one."""
 HISTORY = 32
@@ -163,7 +162,7 @@ class Stages:
         self.by_file = self.text_hash
         """Hash of what that file says; once a document is agreed, the node does not go by the file."""
         self.counters: Counter[str] = Counter()
-        self.problems: dict[str, str] = {}
+        self.problems: dict[ProblemKey, str] = {}
         self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
 
         # PROFILE, GATEWAY
@@ -412,12 +411,15 @@ class Stages:
         """For how long the relay has told no counts; 0 before the first."""
         return 0.0 if self.counted_at is None else max(now - self.counted_at, 0.0)
 
-    def set_problem(self, source: str, problem: str | None) -> None:
+    def set_problem(self, kind: str, text: str | None, subject: str = "") -> None:
         """Show a problem in the status, or (``None``) that it is over."""
-        if problem is None:
-            self.problems.pop(source, None)
-        else:
-            self.problems[source] = problem
+        self.problems.pop((kind, subject), None)
+        if text is not None:
+            self.problems[kind, subject] = text
+
+    def clear_problems(self, *kinds: Problem) -> None:
+        """Show none of these any more: what they come from says them again, where it is still so."""
+        self.problems = {key: text for key, text in self.problems.items() if key[0] not in kinds}
 
 
 Handler = Callable[[Stages, Any, ToDo, float], None]

@@ -26,6 +26,7 @@ from zsched.core.values.fleet import NodeSpec, TaskSpec
 from zsched.core.values.gauges import possible
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, Reach, TaskId
 from zsched.core.values.plan import Direction, ReadyWhen, Route, StreamCount
+from zsched.core.values.problems import Problem, Told, parted, told_of
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import (
@@ -42,16 +43,7 @@ from zsched.core.values.snapshot import (
     VoteStatus,
 )
 from zsched.core.values.struct import replace
-from zsched.core.values.words import (
-    NEVER_INITIALISED,
-    NO_SPARE,
-    OWN_CERTIFICATE,
-    RESTARTING,
-    TAKEN_OUT,
-    WAS_READY,
-    shown,
-    told_of_worker,
-)
+from zsched.core.values.words import RESTARTING, WAS_READY, shown, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
 
@@ -66,6 +58,7 @@ DRASTIC_AFTER_S = 60.0
 A recovery beside electors that come back makes two fleets of one.
 """
 RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
+NO_SPARE = "no other candidate can take it"
 HUNG_LEAST_S = 8.0
 """A job that takes `HUNG_TIMES` as long as jobs have taken may hang; one that takes less than this does not..."""
 HUNG_FIRST_S = 30.0
@@ -77,6 +70,14 @@ LATE_RATIO = 0.5
 def build_snapshot(node: Stages, now: float) -> Snapshot:
     """The whole status of ``node`` at ``now`` (monotonic seconds)."""
     quorum = _quorum(node)
+    problems, kinds = parted(
+        *node.namesakes.problems(now),
+        *_problems(node, quorum, now),
+        *_overloads(node, now),
+        *_disk_problems(node),
+        *_relay_problems(node, now),
+        *told_of(node.knocking.problems(now, node.fleet_path, is_agreed=bool(node.agreement.document_hash))),
+    )
     return Snapshot(
         schema=SCHEMA,
         version=node.version,
@@ -99,14 +100,8 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         refused=node.refused_keys.told(node.fleet, now),
         security=node.security,
         order_s=node.fleet.timing.order_s,
-        problems=(
-            *node.namesakes.problems(now),
-            *_problems(node, quorum, now),
-            *_overloads(node, now),
-            *_disk_problems(node),
-            *_relay_problems(node, now),
-            *node.knocking.problems(now, node.fleet_path, is_agreed=bool(node.agreement.document_hash)),
-        ),
+        problems=problems,
+        problem_kinds=kinds,
     )
 
 
@@ -126,31 +121,31 @@ def build_explanation(node: Stages, task: TaskId, now: float) -> Explanation:
     )
 
 
-def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]:
+def _problems(node: Stages, quorum: QuorumStatus, now: float) -> list[Told]:
     if _is_never_initialised(node, quorum):
-        others = {source: text for source, text in node.problems.items() if source != "state"}
+        others = {key: text for key, text in node.problems.items() if key != (Problem.STATE, "")}
         names = ", ".join(quorum.stateless)
         first = (
-            f"{NEVER_INITIALISED}: no elector heard has a state ({names}), and nobody knows of one. "
+            f"never initialised: no elector heard has a state ({names}), and nobody knows of one. "
             "If this node has lost its state and the fleet lives on elsewhere, first bring here, as the fleet file, "
             "what `zsched fleet export` writes on a living node, then `zsched init` here alone. If the fleet is new: "
             "Stop every daemon, run `zsched init` on every node, and start them again"
         )
-        return (first, *(f"{source}: {text}" for source, text in sorted(others.items())))
+        return [(Problem.NEVER_INITIALISED, first), *told_of(others)]
     said = {**node.problems, **node.agreement.problems}
-    is_out = TAKEN_OUT in said.get("fleet/document", "")
+    is_out = (Problem.TAKEN_OUT, "") in said
     states = node.membership.states()
     if is_out:  # the others go by another document, as they should
-        said = {source: text for source, text in said.items() if source.partition("/")[2] not in states}
-    problems = [f"{source}: {text}" for source, text in sorted(said.items())]
-    is_apart = any(source.startswith("generation/") for source in said)
+        said = {key: text for key, text in said.items() if key[1] not in states}
+    problems = told_of(said)
+    is_apart = any(kind == Problem.GENERATION for kind, _ in said)
     is_alone = node.solitude.is_alone(now, has_heard=node.membership.has_heard)
     if is_alone and not is_apart and not node.knocking.problems(now):
-        may_be_refused = node.fleet.security is not None and OWN_CERTIFICATE not in said  # that line says why
+        may_be_refused = node.fleet.security is not None and (Problem.CERTIFICATE, "") not in said  # that line says why
         problems.insert(0, node.solitude.problem(node.me if may_be_refused else ""))
     if quorum.stateless:
-        names = ", ".join(quorum.stateless)
-        problems.append(f"electors without their state, {len(quorum.stateless)} of {quorum.electors}: {names}")
+        named = f"{len(quorum.stateless)} of {quorum.electors}: {', '.join(quorum.stateless)}"
+        problems.append((Problem.STATELESS, f"electors without their state, {named}"))
     fresh = _never_had_one(node, quorum)
     has_enough = quorum.electors - len(quorum.stateless) >= quorum.needed
     if fresh and has_enough:
@@ -163,7 +158,7 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     if not quorum.ok:
         # A fleet that lives on elsewhere must not become two.
         is_left_behind = is_out or is_apart or (is_alone and not node.agreement.is_elector)
-        problems.append(_no_quorum(node, quorum, now, is_left_behind=is_left_behind))
+        problems.append((Problem.NO_QUORUM, _no_quorum(node, quorum, now, is_left_behind=is_left_behind)))
         if not is_alone and not is_out:  # who was taken out is let in nowhere: the electors are well
             problems += [f"elector {told}" for name in node.fleet.electors if (told := _why_silent(node, name, now))]
     elif quorum.alive == quorum.needed < quorum.electors:
@@ -183,21 +178,18 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> tuple[str, ...]
     if quorum.ok and not voters:
         problems.append("nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one")
     elif quorum.ok and len(voters) - len(silent) < needed:
-        replaced = (
-            f" An owner that is gone, stops or fails is still replaced{never_heard}"
-            if len(silent) < len(voters)
-            else ""
-        )
+        still = f"An owner that is gone, stops or fails is still replaced{never_heard}"
+        replaced = still if len(silent) < len(voters) else "No owner is replaced"
         problems.append(
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
-            f"not {told}.{replaced or ' No owner is replaced'}"
+            f"not {told}. {replaced}"
         )
     if not has_enough and not node.has_others_state:
-        problems.append(_nothing_agreed(node, quorum, fresh, now))
+        problems.append((Problem.NOTHING_AGREED, _nothing_agreed(node, quorum, fresh, now)))
     problems += _behind(node, now)
     if not node.has_state and not node.has_foreign_state and not node.has_others_state:
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
-    return tuple(problems)
+    return problems
 
 
 def _overloads(node: Stages, now: float) -> Iterator[str]:
@@ -331,7 +323,7 @@ def _relay_problems(node: Stages, now: float) -> Iterator[str]:
     """Relays that do not stay: their robots' streams pause each time, although the tasks look well from here."""
     for name in node.membership.states():
         told = _relay_told(node, name, now)
-        if told and not (name == node.me and "relay" in node.problems):
+        if told and not (name == node.me and (Problem.RELAY, "") in node.problems):
             yield f"the relay of {name} {told}; its streams rest meanwhile: look at the log of zsched on {name}"
 
 
@@ -424,6 +416,7 @@ def _flag_status(node: Stages, flag: Flag, now: float) -> FlagStatus:
 def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
     value = node.registers[spec.name].value
     executor, standing = node.executors[spec.name], node.rounds.tasks[spec.name]
+    problems, kinds = parted(*_task_problems(node, spec, value, now))
     owner_state = "none" if value.owner is None else node.membership.state(value.owner).value
     prefix = f"{spec.name}/"
     routes = {route.stream: route for route in executor.routes}
@@ -440,7 +433,8 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
         round_trips=_round_trips(node, spec) if value.tuning.deadline_ms is not None else (),
         decision=_decision(standing, now),
         vote=_vote(node.votes.tasks[spec.name], now),
-        problems=tuple(_task_problems(node, spec, value, now)),
+        problems=problems,
+        problem_kinds=kinds,
         pause=_hold(node, value, "pause", now),
         pin=_hold(node, value, "pin", now),
         rollout=_rollout(node, spec, now),
@@ -504,7 +498,7 @@ def _round_trips(node: Stages, spec: TaskSpec) -> tuple[tuple[NodeId, float], ..
     )
 
 
-def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) -> Iterator[str]:
+def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) -> Iterator[Told]:
     executor, owner = node.executors[task.name], value.owner
     if differs := node.sealing.problem(task, value, now):
         yield differs
@@ -535,7 +529,8 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         is_server_ready &= name != server or load.state is WorkerState.READY
         why = f": {load.reason}" if load.reason else ""
         if load.state is WorkerState.FAILED:
-            yield f"the worker on {name} failed{why}; mend it, then `zsched restart {task.name} {name}`"
+            told = f"the worker on {name} failed{why}; mend it, then `zsched restart {task.name} {name}`"
+            yield Problem.WORKER_FAILED, told
         elif (name == server and load.state is not WorkerState.READY) or (
             _is_in_the_way(task, load) and (owner is None or _may_follow(node, task, profile, server))
         ):
@@ -558,7 +553,7 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
     state = PeerState.UNKNOWN if owner is None else node.membership.state(owner)
     is_served = owner == server and is_server_ready and state is PeerState.ALIVE
     if owner is not None and (is_served or state in (PeerState.SUSPECT, PeerState.GONE)):
-        yield from _no_spare(node, task, value, owner, now)
+        yield from ((Problem.NO_SPARE, text) for text in _no_spare(node, task, value, owner, now))
     for name in sorted(node.unseen.found.get(task.name, ())):
         if name != owner:  # of the owner the wait is told, below
             is_seen = node.probation.sees(name, task.name)

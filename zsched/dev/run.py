@@ -16,6 +16,7 @@ from typing import IO, Final
 from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Standby
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.problems import Problem, of_kind
 from zsched.core.values.struct import Struct, field
 from zsched.core.values.words import shown
 from zsched.dev.nodes import Json, Nodes
@@ -225,20 +226,19 @@ class Run:
         self._say(f"{name}: {where} (epoch {shown(now[1])}{': ' if reason else ''}{reason})")
 
     def _tell_worker(self, node: NodeId, task: TaskId, state: str) -> None:
-        known = (node, task) in self._failed
-        if state == "failed" and not known:
+        if state == "failed" and (node, task) not in self._failed:
             self._failed.add((node, task))
             retry = f"mend it, then `zsched restart {task} {node} --runtime-dir {self._nodes.folder} --node {node}`"
             again = "mend it and save it, and it is started again" if self._watched.files.get(task) else retry
             self._say(f"{task}: its worker on {node} has failed; {again}")
-        elif state == "ready" and known:
+        elif state == "ready":
             self._failed.discard((node, task))
 
     def _problems(self, status: Json) -> Iterator[str]:
         """What the tasks' status calls wrong, but for workers that have failed: these have lines of their own."""
         for task in status["tasks"]:
-            failed = tuple(f"the worker on {node} failed" for node, name in self._failed if name == task["name"])
-            yield from (f"{task['name']}: {text}" for text in task["problems"] if not text.startswith(failed))
+            failed = of_kind(task, Problem.WORKER_FAILED)
+            yield from (f"{task['name']}: {text}" for text in task["problems"] if text not in failed)
 
     # --- workers that have changed -----------------------------------------------------------------------------------
 

@@ -11,7 +11,8 @@ from typing import Final
 from zsched import __version__
 from zsched.core.scheduler.flags import HANDS_OVER, told_flag
 from zsched.core.values.document import Flag, FlagKind
-from zsched.core.values.words import NO_SPARE, has_lost_its_worker, told_of_worker
+from zsched.core.values.problems import Problem, of_kind
+from zsched.core.values.words import has_lost_its_worker, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 
 RENEW_RELAY: Final = "when this robot stands still: sudo systemctl stop zsched && sudo systemctl start zsched"
@@ -119,8 +120,8 @@ def lacks_of_owners(status: Json) -> list[Result]:
             fix = f"zsched explain {task['name']} names why each candidate cannot have it"
             found.append(failed(told, fix=fix))
         found += _lost_workers(status, task)
-        spare = (f"{task['name']}: {text}" for text in task["problems"] if text.startswith(NO_SPARE))
-        found += [warned(told, fix="PROBLEMS in zsched status say what each of them lacks") for told in spare]
+        fix = "PROBLEMS in zsched status say what each of them lacks"
+        found += [warned(f"{task['name']}: {text}", fix=fix) for text in of_kind(task, Problem.NO_SPARE)]
     return found
 
 

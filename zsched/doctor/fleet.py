@@ -13,6 +13,7 @@ from typing import Final, TypeVar
 
 from zsched.adapters.network.node_ping import LARGE_S, SIZES, ping
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES, fleet_hash
+from zsched.core.values.problems import Problem, of_kind
 from zsched.core.values.struct import replace
 from zsched.core.values.words import shown
 from zsched.doctor.daemon import judged_lag, lacks_of_owners, problems_of
@@ -256,10 +257,8 @@ def have_true_clocks(scene: Scene) -> Result:
     """Whether no node says that its clock cannot be trusted."""
     found = []
     for name, status in sorted(scene.statuses.items()):
-        for problem in status["problems"]:
-            if str(problem).startswith("clock: "):
-                fix = f"on {name}: chronyc tracking, timedatectl; a time service should step the clock at boot"
-                found.append(warned(f"{name}: {problem}", fix=fix))
+        fix = f"on {name}: chronyc tracking, timedatectl; a time service should step the clock at boot"
+        found += [warned(f"{name}: {text}", fix=fix) for text in of_kind(status, Problem.CLOCK)]
     return joined(found, passed(f"{counted(len(scene.statuses), 'nodes')}, no clock in doubt"))
 
 

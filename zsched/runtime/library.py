@@ -22,7 +22,6 @@ from zsched.core.values.document import Document, Rollout
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import replace
-from zsched.core.values.words import TAKEN_OUT
 from zsched.errors import AdapterError, ConfigError, WireError
 from zsched.guard import guarded
 from zsched.wire.codec import decode_document, document_hash
@@ -36,6 +35,10 @@ MAX_FAULT = 400
 Fetch = Callable[[NodeId, str, float], bytes | None]
 Order = do.StoreDocument | do.AmendDocument | do.FetchDocument | do.KeepDocuments
 log = logging.getLogger("zsched.library")
+
+
+class TakenOutError(ConfigError):
+    """The document does not name this node."""
 
 
 class Library:
@@ -139,10 +142,9 @@ class Library:
             if (name, reason) != self._complaint:  # a full disk refuses it every three seconds
                 log.warning("document refused document=%s why=%s", name, reason)
             self._complaint = (name, reason)
-            is_of_disk = isinstance(error, AdapterError)
-            self._post(
-                ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request, is_of_disk=is_of_disk)
-            )
+            is_of_disk, is_out = isinstance(error, AdapterError), isinstance(error, TakenOutError)
+            refused = ev.DocumentRefused(document=name, reason=reason[:MAX_FAULT], request=request)
+            self._post(replace(refused, is_of_disk=is_of_disk, is_taken_out=is_out))
             return
         self._complaint = ("", "")
         if name in self._recent:  # one that comes again takes no other's place
@@ -171,8 +173,8 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
     if result.fleet.name != fleet:
         raise ConfigError(f"the document is of the fleet {result.fleet.name!r}, this node of {fleet!r}")
     if all(one.name != node for one in result.fleet.nodes):
-        advice = f"{TAKEN_OUT}, and goes on by its last one until `zsched leave`"
-        raise ConfigError(f"the document names no node {node!r}: {advice}")
+        advice = "this machine was taken out, and goes on by its last one until `zsched leave`"
+        raise TakenOutError(f"the document names no node {node!r}: {advice}")
     if result.fleet.security is None and _secures(config, fleet):
         advice = "put it into the document, or, to end it, first delete it from the fleet file of every machine"
         raise ConfigError(f"the document has no section `security:`, and {config} has one: {advice}")

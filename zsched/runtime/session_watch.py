@@ -19,7 +19,7 @@ from zsched.core.node import Node
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId
-from zsched.core.values.words import OWN_CERTIFICATE
+from zsched.core.values.problems import Problem
 from zsched.errors import ConfigError
 from zsched.runtime import renewal
 from zsched.runtime import tls as daemon_tls
@@ -122,7 +122,7 @@ class SessionWatch:
         if now >= self._next_look or left != before:
             self._next_look = now + LOOK_S
             with contextlib.suppress(ConfigError):  # it is being replaced
-                node.set_problem(OWN_CERTIFICATE, renewal.problem(self._fleet, renewal.now_utc()))
+                node.set_problem(Problem.CERTIFICATE, renewal.problem(self._fleet, renewal.now_utc()))
             if self._lets_in_others or left or self._has_another_certificate(node):
                 candidates = [task.candidates for task in node.fleet.tasks]
                 order = turns((*alive, node.me), electors, node.tenure.voters, candidates)

@@ -30,6 +30,7 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import ChangeFleet, CommandOutcome
 from zsched.core.values.model import NodeId, NodeKind, ScoreForm, Tuning, Weights
+from zsched.core.values.problems import Problem
 from zsched.core.values.struct import replace
 from zsched_lab.sim.checks import unsettled
 from zsched_lab.sim.links import Pair
@@ -325,7 +326,7 @@ class Schedule:
         self._give_again()
         for machine in tuple(sim.machines.values()):
             sim.unpause(machine, machine.life)
-            if machine.node is not None and machine.node.agreement.problems.get("fleet/document"):
+            if machine.node is not None and machine.node.agreement.problems.get((Problem.DOCUMENT, "")):
                 sim.crash(machine.key)  # the operator has put it right: it looks at the document again
         self.members.start_all()
         if self.done["cloned"]:

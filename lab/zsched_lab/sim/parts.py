@@ -16,6 +16,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.plan import Role
+from zsched.core.values.problems import Problem
 from zsched.errors import WireError
 from zsched.wire import codec as wire
 
@@ -214,7 +215,7 @@ class Machine:
     def believes_its_clock(self) -> bool:
         """Whether its node has heard all that the watch has told, and is in no doubt; true of one that does not run."""
         is_behind = self.is_paused or bool(self.inbox)
-        return self.node is None or not (is_behind or "clock" in self.node.problems)
+        return self.node is None or not (is_behind or (Problem.CLOCK, "") in self.node.problems)
 
     def end(self) -> None:
         """The process is gone, and what it held in memory; its worker with it."""

@@ -22,6 +22,7 @@ from zsched.core.electorate.recovery import (
     sides_of,
 )
 from zsched.core.values.model import NodeId
+from zsched.core.values.problems import Problem
 from zsched.wire import codec as wire
 from zsched_lab.sim.checks import DisagreementError
 from zsched_lab.sim.members import Members
@@ -29,7 +30,6 @@ from zsched_lab.sim.parts import Machine
 
 SHOWN_S: Final = 8.0
 """So long after a cut a node knows that a peer is of another generation."""
-SAYS_STRANGER: Final = "generation/"
 LEAST_OF_TWO: Final = 4
 """So many nodes make two halves of two."""
 
@@ -184,7 +184,7 @@ class Recoveries(Members):
         """Whom a node shows as of another generation, whether or not its own document names them."""
         node, now = self.sim.node(name), self.sim.machines[name].clock.local(self.sim.now)
         told = (*node.agreement.problems, *node.knocking.problems(now))
-        return {text.partition(":")[0].removeprefix(SAYS_STRANGER) for text in told if text.startswith(SAYS_STRANGER)}
+        return {subject for kind, subject in told if kind == Problem.GENERATION}
 
     def halves(self) -> None:
         """The fleet is cut in two, each half is recovered that cannot agree, and the cut heals.

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 from zsched.core.status import build_snapshot
 from zsched.core.values.model import NodeId, PeerState
+from zsched.core.values.problems import Problem
 from zsched.core.values.quorum import majority
 from zsched.core.values.snapshot import Snapshot
 from zsched_lab.sim.simulator import Simulator
@@ -40,7 +41,7 @@ def _untrue(sim: Simulator, running: tuple[NodeId, ...], said: Snapshot) -> Iter
         yield f"that {quorum.stateless} have no state, and {lost} have none"
     if (quorum.alive, quorum.ok) != (len(fit), len(fit) >= majority(len(sim.fleet.electors))):
         yield f"that {quorum.alive} electors can answer (ok: {quorum.ok}), and {len(fit)} can"
-    is_told = any("without their state" in one for one in said.problems)
+    is_told = Problem.STATELESS in said.problem_kinds
     if bool(quorum.stateless) is not is_told:
         yield f"in its problems {said.problems}, and {quorum.stateless} have no state"
     for task in said.tasks:

@@ -52,6 +52,7 @@ class Hall:
         self.looks_of_robot2, self.fetches_after = 0, 0
         self.asked: list[str] = []
         self.problems: list[str] = []
+        self.problem_kinds: list[str] = []
         self.unknowing = 0
         """Looks at robot3, once it is flagged, at which its daemon has just begun."""
         self.loses_an_answer = False
@@ -95,7 +96,7 @@ class Hall:
         }
         quorum = {**STATUS["quorum"], "ok": self.quorum_ok, "names": self.electors, "pilot": "it waits for a spare"}
         body = {**STATUS, "fleet": "hall", "node": who, "nodes": nodes, "tasks": [task], "quorum": quorum}
-        return {**body, "fleet_revision": self.revision, "problems": self.problems}
+        return {**body, "fleet_revision": self.revision, "problems": self.problems, "problem_kinds": self.problem_kinds}
 
     def _fleet(self, who: str) -> Json:
         if who == "robot3" and any(flag["kind"] == "leave" for flag in self.flags):
@@ -300,7 +301,10 @@ def test_a_machine_that_was_taken_out_only_stops(hall: Hall) -> None:
 def test_a_machine_that_was_taken_out_and_is_not_answered_any_more_only_stops_too(hall: Hall) -> None:
     """It has the last document that names it, and no quorum: there is nobody left to tell."""
     hall.quorum_ok = False
-    hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+    hall.problems, hall.problem_kinds = (
+        ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"],
+        ["taken_out"],
+    )
     done = run("--yes")
     assert done.exit_code == 0, done.output
     assert (hall.asked, left(hall.folder)) == (["leave"], RENAMED)
@@ -362,7 +366,10 @@ def test_whatever_the_others_agree_it_asks_before_it_puts_files_away(
     if why in ("taken out", "it ended"):
         hall.text = TEXT.replace("  robot3: {kind: robot}\n", "")
     elif why == "told so":
-        hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+        hall.problems, hall.problem_kinds = (
+            ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"],
+            ["taken_out"],
+        )
     else:
         words += ["--accept", why if why == "last-node" else "not-told"]
         hall.text, hall.quorum_ok = ALONE if why == "last-node" else TEXT, why != "not-told"
@@ -437,7 +444,10 @@ def test_broken_off_behind_the_daemon_it_goes_on_also_where_another_node_took_it
     hall: Hall, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
     if way == "told so":
-        hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+        hall.problems, hall.problem_kinds = (
+            ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"],
+            ["taken_out"],
+        )
     else:
         hall.is_told_gone, hall.text = True, TEXT.replace("  robot3: {kind: robot}\n", "")
 
@@ -560,7 +570,10 @@ def test_a_machine_that_holds_the_authority_says_so_before_it_leaves(hall: Hall,
 
 def test_one_that_is_out_already_is_told_of_the_authority_and_leaves(hall: Hall) -> None:
     folder = hold_authority(hall)
-    hall.problems = ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"]
+    hall.problems, hall.problem_kinds = (
+        ["fleet/document: the document names no node 'robot3': this machine was taken out, and goes on"],
+        ["taken_out"],
+    )
     done = run("--yes")
     assert (done.exit_code, left(hall.folder)) == (0, RENAMED), done.stderr
     assert f"holds-authority: {folder}" in done.stderr

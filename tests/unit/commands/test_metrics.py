@@ -95,7 +95,10 @@ def test_a_task_that_no_other_candidate_could_take_is_told() -> None:
     status = recorded()
     assert values(metrics_text(status), "zsched_task_without_spare") == {("echo",): 0}
     status["tasks"][0]["problems"] = ["another one", "no other candidate can take it"]
+    status["tasks"][0]["problem_kinds"] = ["other", "no_spare"]
     assert values(metrics_text(status), "zsched_task_without_spare") == {("echo",): 1}
+    del status["tasks"][0]["problem_kinds"]
+    assert values(metrics_text(status), "zsched_task_without_spare") == {}, "an older daemon does not tell"
 
 
 def test_degraded_is_told_and_what_is_not_measured_is_left_out() -> None:

@@ -365,7 +365,7 @@ def test_healthy_fleet_is_not_degraded() -> None:
 def test_a_lost_quorum_is_told_once_with_what_the_daemon_says_of_it() -> None:
     status = recorded("degraded")
     said = "no quorum: 1 of 3 electors can answer, 2 needed; waiting for robot2, robot3"
-    status["problems"] = [said]
+    status["problems"], status["problem_kinds"] = [said], ["no_quorum"]
     assert [one for one in all_problems(status) if one.startswith("no quorum")] == [said]
 
 

@@ -21,11 +21,11 @@ from zsched.core import instructions as do
 from zsched.core.electorate.strangers import SHOWN_S
 from zsched.core.executor.handover import HEARS_S
 from zsched.core.executor.sparing import Sparing
+from zsched.core.handlers import work
 from zsched.core.handlers.work import FROM_A_PEER, carry_out
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.knocking import KNOCKERS_KEPT, SHOWN_AFTER_S
 from zsched.core.node import Node
-from zsched.core.stages import OWN_FILE
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
@@ -49,6 +49,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, PeerState, RegisterState
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
+from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.profile import Echo, WorkerLoad, WorkerState
 from zsched.core.values.words import CREATION_STEP
 
@@ -383,6 +384,16 @@ def test_an_order_that_came_behind_a_move_is_not_told_as_the_move(revision: int,
     assert len(node.rounds.tasks["merge"].fuse.memory().moves) == (told == FROM_A_PEER)
 
 
+def test_that_another_node_committed_a_value_hangs_on_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "FROM_A_PEER", "somebody said so")
+    node = started()
+    batch = node.handle(learnt_from("robot2", allocation_of(4, "edge1", 2)), node.next_deadline())
+    assert [is_known for *_, is_known in moves_in(batch)] == [True], "the first news"
+    node.handle(learnt_from("robot2", allocation_of(6, "edge2", 3, asked=Asked(by="ada@robot1"))), 100.5)
+    assert node.history["merge"][-1].reason == "somebody said so"
+    assert len(node.rounds.tasks["merge"].fuse.memory().moves) == 1
+
+
 def test_an_owner_that_was_there_before_the_start_is_told_as_known_and_the_next_one_as_a_move() -> None:
     node = make("robot1", learnt=allocation_of(4, "edge1", 2))
     assert moves_in(node.start(100.0)) == [(None, "edge1", 2, True)]
@@ -592,12 +603,12 @@ def test_what_a_relay_complained_of_ends_with_it_and_with_the_task() -> None:
         node.handle(ev.ProblemReported(source=source, problem="broken"), 100.0)
     less = replace(FLEET, tasks=(replace(*FLEET.tasks, name="other"),))
     node.handle(ev.FleetChanged(fleet=less), 100.1)
-    assert {*node.problems} == {"relay/other", "relay/local", "profile"}
+    assert {*node.problems} == {("relay", "other"), ("relay", "local"), ("profile", "")}
     node.handle(ev.RelayChanged(is_running=False, reason="exit code -9"), 100.2)
-    assert {*node.problems} == {"relay", "profile"}
+    assert {*node.problems} == {("relay", ""), ("profile", "")}
     node.handle(ev.ProblemReported(source="relay/local", problem="broken"), 100.3)
     node.handle(ev.RelayChanged(is_running=True), 100.4)
-    assert {*node.problems} == {"relay/local", "profile"}, "the next one has said it before it was ready"
+    assert {*node.problems} == {("relay", "local"), ("profile", "")}, "the next one has said it before it was ready"
 
 
 def test_a_relay_that_has_gone_leaves_every_slot_to_be_taken_again() -> None:
@@ -635,7 +646,7 @@ def test_a_slot_of_a_foreign_worker_says_which_key_nobody_takes() -> None:
 def test_our_own_name_elsewhere_is_a_problem_until_its_token_goes() -> None:
     node = started()
     node.handle(ev.TokenSeen(node="robot1", incarnation=8), 100.0)
-    assert node.problems["membership"].startswith("another daemon calls itself 'robot1'; stop it")
+    assert node.problems["membership", ""].startswith("another daemon calls itself 'robot1'; stop it")
     node.handle(ev.TokenLost(node="robot1", incarnation=7), 100.0)
     assert node.problems, "our own token, seen from outside, says nothing about the other's"
     node.handle(ev.TokenLost(node="robot1", incarnation=8), 100.0)
@@ -655,7 +666,7 @@ def test_beats_in_our_name_alone_are_a_complaint_that_ends_and_nothing_else() ->
     """Anybody can put beats: they write nothing to disk, make nobody leave, and are forgotten."""
     node = started()
     batch = hear_twin(node, 100.0, 60)
-    assert "somebody sends beats in the name of 'robot1'" in node.problems["membership"]
+    assert "somebody sends beats in the name of 'robot1'" in node.problems["membership", ""]
     assert of(batch, do.StandDown) == []
     assert not any(one.state.disputed for one in of(batch, do.PersistState))
     assert node.agreement.is_elector
@@ -740,11 +751,13 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
     strange = replace(beat("robot2", 1), fleet_file="0123456789abcdef")
     node.handle(ev.BeatReceived(beat=strange), 100.0)
     told = f"robot2 goes by another fleet file (0123456789abcdef, here {node.fleet_file}): compare them ("
-    assert node.problems["fleet/robot2"].startswith(told)
-    assert node.problems["fleet/robot2"].endswith("restart no daemon: docs/guide/service.md, Add or remove a machine")
+    assert node.problems["fleet", "robot2"].startswith(told)
+    assert node.problems["fleet", "robot2"].endswith(
+        "restart no daemon: docs/guide/service.md, Add or remove a machine"
+    )
     node.fleet_path = "/etc/zsched/fleet.yaml"
     node.handle(ev.BeatReceived(beat=replace(strange, sequence=2)), 100.1)
-    assert f"here {node.fleet_file} of /etc/zsched/fleet.yaml)" in node.problems["fleet/robot2"]
+    assert f"here {node.fleet_file} of /etc/zsched/fleet.yaml)" in node.problems["fleet", "robot2"]
     node.handle(ev.BeatReceived(beat=replace(beat("robot2", 3), fleet_file=node.fleet_file)), 100.2)
     assert node.problems == {}
 
@@ -755,7 +768,7 @@ def test_a_node_of_another_generation_is_told_while_it_beats() -> None:
     said: dict[str, dict[str, Any]] = {"robot2": {"generation": 1}, "robot3": {"lease_terms": f"{'ab' * 8}/2"}}
     for name, strange in said.items():
         node.handle(ev.BeatReceived(beat=beat_of(name, 2, incarnation=3, **strange)), now)
-    assert set(node.agreement.problems) == {f"generation/{name}" for name in said}
+    assert set(node.agreement.problems) == {(Problem.GENERATION, name) for name in said}
     while now < 100.1 + SHOWN_S + 1.0:
         now = node.next_deadline()
         node.handle(ev.DeadlineReached(), now)
@@ -767,14 +780,14 @@ def test_who_goes_while_it_has_another_fleet_file_is_no_problem_until_it_is_back
     node, now = started(), 100.0
     strange = replace(beat("robot2", 2), fleet_file="0123456789abcdef")
     node.handle(ev.BeatReceived(beat=strange), now)
-    assert "fleet/robot2" in node.problems
+    assert ("fleet", "robot2") in node.problems
     while node.membership.state("robot2") is not PeerState.GONE:
         now = node.next_deadline()
         assert now < 110.0
         node.handle(ev.DeadlineReached(), now)
-    assert "fleet/robot2" not in node.problems
+    assert ("fleet", "robot2") not in node.problems
     node.handle(ev.BeatReceived(beat=replace(strange, sequence=3)), now)
-    assert "fleet/robot2" in node.problems
+    assert ("fleet", "robot2") in node.problems
 
 
 def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
@@ -799,8 +812,8 @@ def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
     )
     assert "and is in no line of this one: compare them (`zsched check` tells a file's hash)" in said[0]
     agreed = node.knocking.problems(last, is_agreed=True)
-    assert agreed[0] == (
-        "fleet/robot10: robot10 beats in this fleet, and the agreed document does not name it: `zsched leave` on that "
+    assert agreed[Problem.FLEET, "robot10"] == (
+        "robot10 beats in this fleet, and the agreed document does not name it: `zsched leave` on that "
         "machine if it was taken out, `zsched invite robot10` here if it shall come"
     )
     assert told(last + QUIET_S) == []
@@ -822,7 +835,7 @@ def test_adapters_problem_comes_and_goes_by_its_source() -> None:
     node.handle(ev.ProblemReported(source="PublishBeat", problem="closed"), 100.0)
     node.handle(ev.ProblemReported(source="profile", problem="no /proc"), 100.0)
     node.handle(ev.ProblemReported(source="PublishBeat", problem=None), 100.0)
-    assert node.problems == {"profile": "no /proc"}
+    assert node.problems == {("profile", ""): "no /proc"}
 
 
 # --- peers -----------------------------------------------------------------------------------------------------------
@@ -877,24 +890,31 @@ def test_beats_in_turn_are_no_news() -> None:
     ("news", "is_calm"),
     [
         (ev.ProblemReported(source="disk", problem="slow"), True),
-        (ev.ProblemReported(source=OWN_FILE, problem="it differs"), True),
+        ((Problem.OWN_FILE, ""), True),
+        ((Problem.FLEET, ""), True),
         (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", last_seen_s=1.5),)), True),
-        (ev.ProblemReported(source="fleet/document", problem="it is fetched"), False),
+        ((Problem.FLEET, "robot9"), False),
         (ev.StreamsCounted(counts=(StreamCount(stream="merge/in/0", in_flight=1),)), False),
         (accept(5, "robot2", allocation_of(5, "edge2", 3)), False),
     ],
     ids=[
         "at rest",
         "a file of its own",
+        "a changed file that is not in force",
         "a relay that tells no more",
-        "a problem of the fleet",
+        "another file elsewhere",
         "a sample under way",
         "a value that is not learnt yet",
     ],
 )
-def test_beats_say_that_a_node_is_calm_while_nothing_goes_on_there(news: ev.Event, *, is_calm: bool) -> None:
+def test_beats_say_that_a_node_is_calm_while_nothing_goes_on_there(
+    news: ev.Event | ProblemKey, *, is_calm: bool
+) -> None:
     node, sent = started(learnt=allocation_of(4, "edge1", 2)), False
-    node.handle(news, 100.0)
+    if isinstance(news, tuple):
+        node.set_problem(news[0], "told", news[1])
+    else:
+        node.handle(news, 100.0)
     for number in range(2, 35):
         now = 100.0 + 0.2 * number
         while node.next_deadline() < now:
@@ -1316,7 +1336,7 @@ def test_a_document_that_was_not_valid_beside_this_machines_file_is_tried_again_
     """It was refused until the daemon's next start, though the operator had done what the problem said."""
     node = started()
     refused = node.agreement._numbers.documents.refused
-    refused["0d"] = "it has no section `security:`, and the file here has one"
+    refused["0d"] = Problem.DOCUMENT, "it has no section `security:`, and the file here has one"
     node.handle(ev.FleetChanged(fleet=FLEET), 101.0)
     assert refused == {}
 

@@ -242,7 +242,7 @@ def test_a_disk_that_refuses_costs_the_electorate_one_and_nobody_the_task(name: 
         sim.run(2)
         node = sim.node(name)
         assert not node.agreement.is_elector
-        assert "no elector" in node.agreement.problems["state"]
+        assert "no elector" in node.agreement.problems["state", ""]
         assert sim.disk(name) == before
         assert name not in ROBOTS or node.executors[TASK].phase is Phase.SETTLED
 

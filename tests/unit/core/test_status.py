@@ -18,6 +18,7 @@ from support.states import state_of
 from zsched.commands.report import degradations, render_status
 from zsched.core import events as ev
 from zsched.core import instructions as do
+from zsched.core import status
 from zsched.core.instructions import RecordStory
 from zsched.core.membership.solitude import TAKEN
 from zsched.core.node import Node
@@ -38,9 +39,10 @@ from zsched.core.values.fleet import (
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import PeerState, ScoreForm
 from zsched.core.values.plan import ReadyWhen, StreamCount
+from zsched.core.values.problems import Problem
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched.core.values.words import OWN_CERTIFICATE, RESTARTING, TAKEN_OUT, WAS_READY, told_of_worker
+from zsched.core.values.words import RESTARTING, WAS_READY, told_of_worker
 from zsched.core.vote.agreement import Agreement
 from zsched_lab.sim.simulator import Simulator
 
@@ -204,7 +206,7 @@ def test_a_node_with_another_fleets_state_is_not_told_to_begin_anew() -> None:
     node = make(has_state=False)
     for sequence, name in enumerate(("robot2", "robot3"), 2):
         node.handle(ev.BeatReceived(beat=beat_of(name, sequence, incarnation=3, has_lost_state=True)), 100.0)
-    node.problems["state"] = "/x/state belongs to the fleet 'yard', not 'hall': ... (`zsched leave`)"
+    node.problems["state", ""] = "/x/state belongs to the fleet 'yard', not 'hall': ... (`zsched leave`)"
     assert any("zsched init" in one for one in build_snapshot(node, 100.0).problems)
     node.has_others_state = True
     told = build_snapshot(node, 100.0).problems
@@ -212,21 +214,21 @@ def test_a_node_with_another_fleets_state_is_not_told_to_begin_anew() -> None:
     assert not any("zsched init" in one for one in told)
 
 
-@pytest.mark.parametrize("subject", ["generation/robot3", "fleet/document", "alone"])
+@pytest.mark.parametrize("subject", [Problem.GENERATION, Problem.TAKEN_OUT, "alone"])
 def test_a_node_of_a_fleet_that_lives_on_elsewhere_is_told_nothing_of_a_recovery(subject: str) -> None:
     """Its electors are there, and do not hear this node: a recovery would make a second fleet."""
     node = make("edge1", alive=())
-    if subject == "generation/robot3":
-        node.problems[subject] = "robot3 counts by another generation of this fleet"
-    if subject == "fleet/document":
-        node.problems[subject] = f"the document names no node 'edge1': {TAKEN_OUT}"
-        node.problems["fleet/robot1"] = "robot1 goes by another fleet file"
+    if subject == Problem.GENERATION:
+        node.problems[subject, "robot3"] = "robot3 counts by another generation of this fleet"
+    if subject == Problem.TAKEN_OUT:
+        node.problems[subject, ""] = "the document names no node 'edge1'"
+        node.problems["fleet", "robot1"] = "robot1 goes by another fleet file"
     with patch.object(Agreement, "document_hash", "0d"):
         problems = build_snapshot(node, 200.0).problems
     assert "no quorum: 0 of 3 electors can answer, 2 needed" in problems
     assert not any("recover`" in one for one in problems)
     is_lonely = any("heard nobody" in one for one in problems)
-    assert is_lonely is (subject != "generation/robot3"), "who has heard of another generation has heard somebody"
+    assert is_lonely is (subject != Problem.GENERATION), "who has heard of another generation has heard somebody"
     assert not any("fleet/robot1" in one for one in problems), "the others go by another document, as they should"
 
 
@@ -235,9 +237,9 @@ def test_a_machine_that_was_taken_out_is_not_told_to_start_the_others() -> None:
     for tick in range(20):
         node.handle(ev.DeadlineReached(), 100.5 + tick / 2)
     assert any(one.startswith("elector robot1 is gone: start") for one in build_snapshot(node, 110.0).problems)
-    node.problems["fleet/document"] = f"the document names no node 'edge1': {TAKEN_OUT}"
+    node.problems[Problem.TAKEN_OUT, ""] = "the document names no node 'edge1'"
     problems = build_snapshot(node, 110.0).problems
-    assert any(TAKEN_OUT in one for one in problems)
+    assert "fleet/document: the document names no node 'edge1'" in problems
     assert not any(one.startswith("elector ") for one in problems), "they run, and let it in no more"
 
 
@@ -245,7 +247,7 @@ def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[s
     """A node of a fleet whose electors say that they have no state."""
     node = make(me, has_state=me not in stateless)
     node.lacks_state_file = lacks_file
-    node.problems["state"] = "/x/state does not exist"
+    node.problems["state", ""] = "/x/state does not exist"
     for name in stateless:
         if name != me:
             beat = beat_of(name, 2, incarnation=3, has_lost_state=True)
@@ -566,11 +568,11 @@ def test_a_node_that_others_do_not_let_in_is_told_that_its_certificate_may_be_ol
     assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody needs a certificate"
     node.fleet = replace(node.fleet, security=Security(folder="/pki"))
     assert invite in build_snapshot(node, 110.0).problems[0]
-    node.set_problem(OWN_CERTIFICATE, "it has not begun: set the clock")
+    node.set_problem(Problem.CERTIFICATE, "it has not begun: set the clock")
     told = build_snapshot(node, 110.0).problems
     assert "certificate: it has not begun: set the clock" in told
     assert not any(invite in one for one in told), "that would revoke a good key"
-    node.set_problem(OWN_CERTIFICATE, None)
+    node.set_problem(Problem.CERTIFICATE, None)
     node.handle(ev.AddressesTried(found=((node.solitude.dialled[0], "refused"),)), 110.0)
     assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody is there at all"
 
@@ -725,6 +727,21 @@ def test_a_task_that_no_other_candidate_could_take_now_says_why() -> None:
     assert problems_of(node) == (failed, "no other candidate can take it: edge2 runs no worker for it")
     told_by(node, "edge1", 2, WorkerState.STARTING)
     assert problems_of(node) == ("the worker on edge1 is starting", failed), "it is not served: that is said first"
+
+
+def test_which_problem_it_is_is_told_beside_the_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status, "NO_SPARE", "nobody else is left")
+    node = served((*EDGES, "edge3"))
+    node.set_problem("measuring", "nothing is measured")
+    told_by(node, "edge2", 1, WorkerState.STARTING)
+    told_by(node, "edge3", 1, WorkerState.FAILED, "no map")
+    snapshot = build_snapshot(node, 100.0)
+    (task,) = snapshot.tasks
+    assert task.problem_kinds == (Problem.WORKER_FAILED, Problem.NO_SPARE)
+    assert task.problems[1].startswith("nobody else is left: ")
+    assert [
+        text for text, kind in zip(snapshot.problems, snapshot.problem_kinds, strict=True) if kind == "measuring"
+    ] == ["measuring: nothing is measured"]
 
 
 def holding(node: Node, name: str, at: float, *, used_mb: float, own_mb: float = 0.0, battery: float = 1.0) -> None:

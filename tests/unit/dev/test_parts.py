@@ -254,6 +254,7 @@ def test_a_run_tells_what_is_wrong_with_its_tasks_but_no_failed_worker_twice(mon
         "owner": None,
         "epoch": 0,
         "problems": ["the worker on edge1 failed: exited with status 3", "the worker on edge2: it may hang"],
+        "problem_kinds": ["worker_failed", "other"],
     }
     node = {"name": "edge1", "workers": [{"task": "shout", "state": "failed"}]}
     monkeypatch.setattr(nodes, "status", lambda: {"tasks": [task], "nodes": [node]}, raising=False)

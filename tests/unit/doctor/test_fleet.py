@@ -181,7 +181,7 @@ def test_what_a_robot_s_streams_wait_for_is_found_from_every_node(tmp_path: Path
 
 def test_a_clock_in_doubt_and_a_problem_elsewhere_are_told(tmp_path: Path) -> None:
     problem = "clock: this machine's clock is slewed by +8.30%, leases allow for 0.10%"
-    scene = planted(fleet_scene(tmp_path), "robot2", problems=[problem])
+    scene = planted(fleet_scene(tmp_path), "robot2", problems=[problem], problem_kinds=["clock"])
     assert_finds(run("fleet.clocks", scene), WARN, "robot2: clock: this machine's clock is slewed")
     assert_finds(run("fleet.problems", scene), WARN, "robot2: clock")
 

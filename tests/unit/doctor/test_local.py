@@ -443,8 +443,9 @@ def test_a_task_that_no_other_candidate_could_take_is_found(tmp_path: Path) -> N
     scene = scene_of(tmp_path)
     (task,) = scene.status["tasks"]
     told = "no other candidate can take it: the worker on edge2 is starting"
-    assert_finds(run("task.owners", answer(scene, tasks=[{**task, "problems": [told]}])), WARN, f"merge: {told}")
-    assert run("task.owners", answer(scene, tasks=[{**task, "problems": ["another one"]}])).verdict is PASS
+    said = {"problems": [told], "problem_kinds": ["no_spare"]}
+    assert_finds(run("task.owners", answer(scene, tasks=[{**task, **said}])), WARN, f"merge: {told}")
+    assert run("task.owners", answer(scene, tasks=[{**task, **said, "problem_kinds": ["other"]}])).verdict is PASS
 
 
 def test_a_fleet_without_tasks_is_said_to_have_none(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_document_that_is_not_valid_here_is_refused_and_not_stored(desk: Desk,
     desk.library.order(do.StoreDocument(request=3, content=document(text=text)))
     event = desk.next()
     assert isinstance(event, ev.DocumentRefused)
-    assert (event.request, event.is_of_disk) == (3, False)
+    assert (event.request, event.is_of_disk, event.is_taken_out) == (3, False, "names no node" in why)
     assert why in event.reason
     assert desk.store.load(event.document) is None
 

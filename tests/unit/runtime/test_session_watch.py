@@ -46,7 +46,7 @@ def test_that_sessions_cannot_be_opened_anew_is_no_problem_any_more_once_nobody_
     assert not any(watch.is_due(node, float(now)) for now in range(1, 400))
     for event in told:
         node.handle(event, 400.0)
-    assert "cannot be opened anew" in node.problems[SESSIONS]
+    assert "cannot be opened anew" in node.problems[SESSIONS, ""]
     watch.note(False, ())
     assert not watch.is_due(node, 401.0)
-    assert SESSIONS not in node.problems
+    assert (SESSIONS, "") not in node.problems

@@ -15,11 +15,13 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from zsched.core import instructions as do
+from zsched.core.events import DocumentRefused
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag, Rollout
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
+from zsched.core.values.problems import Problem
 
 FETCH_EVERY_S = 3.0
 """A document that no peer has sent is asked for again after this time."""
@@ -51,8 +53,8 @@ class Documents:
         self._kept: tuple[str, ...] = tuple(stored)
         self._told: tuple[str, ...] = tuple(sorted(stored))
         """What the disk was told to keep: every document that is known here, or one that comes back is not on it."""
-        self.refused: dict[str, str] = {}
-        """{hash: why it is not valid here}, the newest last."""
+        self.refused: dict[str, tuple[Problem, str]] = {}
+        """{hash: (which problem that is, why it is not valid here)}, the newest last."""
         self.unwritten: dict[str, str] = {}
         """{hash: why the disk has refused it} of those that are wanted still."""
 
@@ -113,19 +115,19 @@ class Documents:
         self._fleets[document], self._flags[document] = fleet, flags
         self._drop_old(todo)
 
-    def on_refused(self, document: str, reason: str, *, is_of_disk: bool = False) -> None:
+    def on_refused(self, event: DocumentRefused) -> None:
         """A document that a peer sent is not valid here: it is not asked for again, unless only the disk refuses it.
 
         One that nobody is asked for is this node's own draft, which is not agreed.
         """
-        if document not in self._wanted:
+        if (document := event.document) not in self._wanted:
             return
-        if is_of_disk:
-            self.unwritten[document] = reason
+        if event.is_of_disk:
+            self.unwritten[document] = event.reason
             return
         self._forget(document)
         self.refused.pop(document, None)
-        self.refused[document] = reason
+        self.refused[document] = Problem.TAKEN_OUT if event.is_taken_out else Problem.DOCUMENT, event.reason
         for old in tuple(self.refused)[:-MAX_WANTED]:
             del self.refused[old]
 

@@ -27,6 +27,7 @@ from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
+from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.struct import replace
 
 
@@ -195,21 +196,18 @@ class Numbers:
         return 0 if self.changed is None else self.changed.number
 
     @property
-    def problems(self) -> dict[str, str]:
-        """{subject: what does not work here as it should}."""
-        found = {} if self.roll is None or not self.roll.problem else {"fleet/register": self.roll.problem}
-        for document, reason in self.documents.refused.items():
-            text = (
-                f"the agreed document {document[:8]} cannot be used here, this node goes on by its last one: {reason}"
-            )
-            found["fleet/document"] = text
-        for document, reason in self.documents.unwritten.items():
-            text = f"the document {document[:8]} cannot be stored here, this node tries again in some seconds: {reason}"
-            found["fleet/document"] = text
-        if "fleet/document" not in found and self.roll is not None and not self.documents.holds(self.roll.value):
-            document = self.roll.value.document[:8]
-            found["fleet/document"] = f"the agreed document {document} is not on this disk: this node asks its peers"
-        return found
+    def problems(self) -> dict[ProblemKey, str]:
+        """{(kind, subject): what does not work here as it should}."""
+        roll, kind, text = self.roll, Problem.DOCUMENT, ""
+        for one, (kind, why) in self.documents.refused.items():  # noqa: B007 - the newest one's stays
+            text = f"the agreed document {one[:8]} cannot be used here, this node goes on by its last one: {why}"
+        for one, why in self.documents.unwritten.items():
+            kind = Problem.DOCUMENT
+            text = f"the document {one[:8]} cannot be stored here, this node tries again in some seconds: {why}"
+        if not text and roll is not None and not self.documents.holds(roll.value):
+            text = f"the agreed document {roll.value.document[:8]} is not on this disk: this node asks its peers"
+        found: dict[ProblemKey, str] = {("fleet/register", ""): "" if roll is None else roll.problem, (kind, ""): text}
+        return {key: told for key, told in found.items() if told}
 
     def next_deadline(self) -> float:
         """When `tick` may have something to do."""

@@ -104,13 +104,13 @@ class Strangers(Struct):
             if now - at >= SHOWN_S:
                 del self._heard[node]
 
-    def problems(self, ours: FleetValue | None) -> dict[str, str]:
-        """{subject: which node is a stranger, and what brings it or this node over}."""
+    def problems(self, ours: FleetValue | None) -> dict[NodeId, str]:
+        """{node: which node is a stranger, and what brings it or this node over}."""
         if ours is None or not self._heard:
             return {}
         here = _called(ours.generation_id, ours.recovered_by)
         return {
-            f"generation/{node}": (
+            node: (
                 f"{node} counts by another generation of this fleet, {_called(told, self._by.get(told, ''))}; this "
                 f"node by {here}; nothing passes between them. The side that has a quorum stays. To bring {node} over: "
                 f"`zsched rejoin {ours.generation_id[:SAID_DIGITS]}` there; only where this side has no quorum, to "

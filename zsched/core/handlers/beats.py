@@ -14,11 +14,12 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.membership.identity import Verdict
 from zsched.core.membership.peers import LOSS_FACTOR, Transition
-from zsched.core.stages import OWN_FILE, Handler, Stages
+from zsched.core.stages import Handler, Stages
 from zsched.core.status import has_quorum
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.model import NodeId, PeerState
+from zsched.core.values.problems import Problem
 
 # --- sent ------------------------------------------------------------------------------------------------------------
 
@@ -29,7 +30,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
     node.beat_sequence += 1
     if has_quorum(node):
         node.quorum_at = now
-    if "membership" in node.problems:
+    if (Problem.MEMBERSHIP, "") in node.problems:
         _complain(node, now)
     node.membership.fade_lag_factor()
     node.agreement.forget(now)
@@ -90,7 +91,7 @@ def is_restless(node: Stages, now: float) -> bool:
         or is_moving
         # a full radio delays beats, and slow ones are too late
         or not all(count.is_still(told_s) for count in node.stream_counts)
-        or any(name.startswith("fleet/") and name != OWN_FILE for name in node.problems)
+        or any(kind == Problem.FLEET and subject for kind, subject in node.problems)
     )
 
 
@@ -105,9 +106,9 @@ def _fitting(node: Stages, beat: Beat) -> Beat:
     sent, left_out = node.beat_room.fit(beat)
     if left_out:
         node.counters["beat_parts_left_out"] += left_out
-    if left_out or "beat" in node.problems:
+    if left_out or (Problem.BEAT, "") in node.problems:
         text = f"{left_out} parts have no room in a beat and come in turn: fewer exclusive tasks, or shorter names"
-        node.set_problem("beat", text if left_out else None)
+        node.set_problem(Problem.BEAT, text if left_out else None)
     return sent
 
 
@@ -174,10 +175,8 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     if node.renewing.told:
         node.renewing.hear(beat.node, beat.fleet_file, now)
     if beat.fleet_file != node.fleet_file or node.problems:
-        node.set_problem(
-            f"fleet/{beat.node}",
-            node.identity.file_complaint(beat, node.fleet_path, is_agreed=bool(node.agreement.document_hash)),
-        )
+        told = node.identity.file_complaint(beat, node.fleet_path, is_agreed=bool(node.agreement.document_hash))
+        node.set_problem(Problem.FLEET, told, beat.node)
     _hear_leases(node, beat, todo, now, is_newest=node.membership.is_newest(beat.node))
 
 
@@ -224,7 +223,7 @@ def _heed(node: Stages, verdict: Verdict, todo: ToDo, now: float) -> None:
 def _complain(node: Stages, now: float) -> str:
     """Show or end the complaint that another daemon uses our name."""
     complaint = node.identity.complaint(now)
-    node.set_problem("membership", complaint)
+    node.set_problem(Problem.MEMBERSHIP, complaint)
     return complaint or ""
 
 
@@ -268,7 +267,7 @@ def on_transition(node: Stages, change: Transition, todo: ToDo, now: float) -> N
         node.probation.on_gone(change.node, now)
         node.sealing.on_gone(change.node)
         node.retuning.on_gone(change.node)
-        node.set_problem(f"fleet/{change.node}", None)  # its first beat says it again, if it is still so
+        node.set_problem(Problem.FLEET, None, change.node)  # its first beat says it again, if it is still so
         for executor in node.executors.values():
             executor.on_gone(change.node, todo)
     todo.must_decide |= any(value.owner == change.node for value in node.values().values())
@@ -281,8 +280,8 @@ def _on_addresses(node: Stages, event: ev.AddressesTried, _todo: ToDo, _now: flo
 def _on_clock(node: Stages, event: ev.ClockCompared, todo: ToDo, now: float) -> None:
     if node.tenure.on_clock(event, node.agreement.standing(), node.beat_sequence, now):
         todo.must_beat = True  # the others must hear whether our echoes count
-    if node.tenure.exclusive or "clock" in node.problems:
-        node.set_problem("clock", node.tenure.clock.complaint if node.tenure.exclusive else None)
+    if node.tenure.exclusive or (Problem.CLOCK, "") in node.problems:
+        node.set_problem(Problem.CLOCK, node.tenure.clock.complaint if node.tenure.exclusive else None)
 
 
 HANDLERS: Final[Mapping[type[Any], Handler]] = {

@@ -19,15 +19,13 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.handlers.work import take_known
-from zsched.core.stages import HISTORY, OWN_FILE, Handler, Stages
+from zsched.core.stages import HISTORY, Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
 from zsched.core.values.model import Allocation, NodeKind, TaskId
+from zsched.core.values.problems import Problem
 from zsched.core.values.words import CREATION_STEP
-
-SOURCE: Final = "fleet"
-"""Of the problem that a file cannot be taken over."""
 
 
 def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
@@ -64,7 +62,7 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
 def _is_refused(node: Stages, fleet: Fleet) -> bool:
     """Whether this daemon cannot take a fleet over at all; the status says so."""
     why = obstacle(node.fleet, fleet, node.me)
-    node.set_problem(SOURCE, f"a changed fleet file is not in force here: {why}" if why else None)
+    node.set_problem(Problem.FLEET, f"a changed fleet file is not in force here: {why}" if why else None)
     return bool(why)
 
 
@@ -88,8 +86,7 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
     node.solitude.timing = fleet.timing
     node.stateless &= names
     node.fileless &= names
-    for source in [source for source in node.problems if source.startswith("fleet/")]:
-        del node.problems[source]  # the next beats say it again, where it is still so
+    node.clear_problems(Problem.FLEET, Problem.OWN_FILE)
     node.gateway.adopt(fleet)
     node.probation.adopt(fleet)
     node.rested.keep(tasks, names)
@@ -136,7 +133,7 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         node.unready.pop(name, None)
         node.renewing.forget(name)
         node.gateway.forget(name)
-        node.set_problem(f"relay/{name}", None)
+        node.set_problem(Problem.RELAY, None, name)
     for stream in [stream for stream in node.missed if stream.partition("/")[0] in kept]:
         del node.missed[stream]
     for executor in come:
@@ -181,7 +178,7 @@ def compare_file(node: Stages) -> None:
             f"`zsched apply {node.fleet_path} --plan`; to take the document: "
             f"`zsched fleet export -o {node.fleet_path}`, then `systemctl reload zsched` (SIGHUP)"
         )
-    node.set_problem(OWN_FILE, complaint)
+    node.set_problem(Problem.OWN_FILE, complaint)
 
 
 def _on_fleet(node: Stages, event: ev.FleetChanged, todo: ToDo, now: float) -> None:

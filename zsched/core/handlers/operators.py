@@ -96,7 +96,8 @@ def _on_commanded(node: Stages, event: ev.Commanded, todo: ToDo, _now: float) ->
 
 
 def _on_problem(node: Stages, event: ev.ProblemReported, _todo: ToDo, _now: float) -> None:
-    node.set_problem(event.source, event.problem)
+    kind, _, subject = event.source.partition("/")
+    node.set_problem(kind, event.problem, subject)
 
 
 def _on_stop(node: Stages, _event: ev.StopRequested, todo: ToDo, _now: float) -> None:

@@ -17,30 +17,25 @@ from zsched.core.values.decision import Move
 from zsched.core.values.fleet import OnIsolation
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, as_reason, told_by
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.problems import Problem
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.words import CREATION_STEP, HAS_RESTED, TOO_FEW_ELECTORS, shown
 
+Why = str | None
+"""Why a value came about; ``None``: another node committed it."""
 FROM_A_PEER: Final = "learnt from a peer"
-"""Why a value came about that another node committed, as far as is known here."""
+"""That one in words."""
 FIRST_NEWS: Final = "known from a peer, the first news here"
 """Why a task has its owner, at a node that knew nothing of the task."""
 
 # --- learnt values ---------------------------------------------------------------------------------------------------
 
 
-def carry_out(
-    node: Stages, value: Allocation, why: str | None, todo: ToDo, now: float, *, is_known: bool = False
-) -> None:
+def carry_out(node: Stages, value: Allocation, why: Why, todo: ToDo, now: float, *, is_known: bool = False) -> None:
     """Carry out a newly learnt value; this batch writes it to disk before anything else.
 
-    Args:
-        node: the stages.
-        value: the value.
-        why: it came about; ``None``: by another node's change.
-        todo: takes what is to be done.
-        now: monotonic seconds.
-        is_known: the value was there before this node's executor was, so it is no change of owner.
+    ``is_known``: the value was there before this node's executor was, so it is no change of owner.
     """
     task, executor = value.task, node.executors[value.task]
     is_new_epoch, is_ours = value.epoch > executor.epoch, why is not None
@@ -122,7 +117,7 @@ def _is_first_news(epoch: int, value: Allocation) -> bool:
     return epoch == 0 and value.owner is not None and value.epoch % CREATION_STEP > 1
 
 
-def _move_of(node: Stages, value: Allocation, why: str | None, *, is_known: bool) -> Move:
+def _move_of(node: Stages, value: Allocation, why: Why, *, is_known: bool) -> Move:
     """A change of owner, with the votes for it as far as this node has heard them.
 
     A robot that did not commit it itself tells the reason of one that wanted it.
@@ -153,7 +148,7 @@ def _has_only_moved(node: Stages, value: Allocation) -> bool:
     return value.revision - revision == value.epoch - epoch > 0
 
 
-def _reason_of(node: Stages, value: Allocation, why: str | None, *, is_new_epoch: bool) -> str:
+def _reason_of(node: Stages, value: Allocation, why: Why, *, is_new_epoch: bool) -> str:
     """Why the value is what it is; a node that did not commit an operator's order tells it from the value.
 
     Who has missed a revision does not know whether the order is the one that has moved the task.
@@ -306,7 +301,6 @@ def _tell_gap(node: Stages, count: StreamCount, todo: ToDo) -> None:
 
 def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> None:
     node.relay_ends.on_changed(event, now)
-    node.set_problem("relay", None if event.is_running else f"the relay is down: {event.reason}")
     if not event.is_running:
         node.probation.forget_tokens()
         node.unseen.forget()
@@ -314,9 +308,9 @@ def _on_relay(node: Stages, event: ev.RelayChanged, _todo: ToDo, now: float) -> 
             if executor.routes:
                 untold = ev.SlotReady(task=name, epoch=executor.epoch, is_ready=False)
                 node.unready[name] = Unready(slot=untold, since=now)
-        for source in [source for source in node.problems if source.startswith("relay/")]:
-            del node.problems[source]  # the next relay says it again, where it is still so
+        node.clear_problems(Problem.RELAY)
         node.counters["relay_exits"] += 1
+    node.set_problem(Problem.RELAY, None if event.is_running else f"the relay is down: {event.reason}")
 
 
 def _on_saved(node: Stages, event: ev.StateSaved, _todo: ToDo, _now: float) -> None:

@@ -15,6 +15,7 @@ from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
 from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import SAID_DIGITS
 from zsched.core.values.model import NodeId
+from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.struct import Struct, field
 
 SHOWN_AFTER_S = 5.0
@@ -42,35 +43,33 @@ class Knocking(Struct):
             since = now if known is None else known.since
             self._heard[beat.node] = _Knock(beat=beat, at=now, since=since, generation=generation)
 
-    def problems(self, now: float, path: str = "", *, is_agreed: bool = False) -> tuple[str, ...]:
-        """The status lines about unknown nodes that were heard lately.
+    def problems(self, now: float, path: str = "", *, is_agreed: bool = False) -> dict[ProblemKey, str]:
+        """What to say of unknown nodes that were heard lately.
 
         Args:
             now: monotonic seconds.
             path: where our own fleet file is.
             is_agreed: the fleet goes by an agreed document, not by a file on each machine.
         """
-        heard = [
-            (name, known)
-            for name, known in sorted(self._heard.items())
-            if now < known.at + QUIET_S and known.at >= known.since + SHOWN_AFTER_S
-        ]
-        return tuple(
-            self._apart(name, known.generation, path, is_agreed=is_agreed)
-            if known.generation
-            else self._unnamed(name, known.beat, path, is_agreed=is_agreed)
-            for name, known in heard
-        )
+        said = dict[ProblemKey, str]()
+        for name, known in sorted(self._heard.items()):
+            if now >= known.at + QUIET_S or known.at < known.since + SHOWN_AFTER_S:
+                continue
+            if known.generation:
+                said[Problem.GENERATION, name] = self._apart(name, known.generation, path, is_agreed=is_agreed)
+            else:
+                said[Problem.FLEET, name] = self._unnamed(name, known.beat, path, is_agreed=is_agreed)
+        return said
 
     def _unnamed(self, name: NodeId, beat: Beat, path: str, *, is_agreed: bool) -> str:
         """A node of our own generation, or of none."""
         if is_agreed:
             return (
-                f"fleet/{name}: {name} beats in this fleet, and the agreed document does not name it: `zsched leave` "
+                f"{name} beats in this fleet, and the agreed document does not name it: `zsched leave` "
                 f"on that machine if it was taken out, `zsched invite {name}` here if it shall come"
             )
         return (
-            f"fleet/{name}: {name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
+            f"{name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
             f"{here(self.fleet_file, path)}), and is in no line of this one: {ONE_FILE}"
         )
 
@@ -78,7 +77,7 @@ class Knocking(Struct):
         """A stranger that our document does not name: an order there would change its half, not ours."""
         ours = "the document agreed here" if is_agreed else f"this node's fleet file ({here(self.fleet_file, path)})"
         return (
-            f"generation/{name}: {name} counts by another generation of this fleet, {generation[:SAID_DIGITS]}, and "
+            f"{name} counts by another generation of this fleet, {generation[:SAID_DIGITS]}, and "
             f"{ours} does not name it; nothing passes between them. The side that has a quorum stays. To bring {name} "
             f"over: `zsched node add` here, then `zsched rejoin` there; only where this side has no quorum, to bring "
             f"this node over: `zsched rejoin {generation[:SAID_DIGITS]}` here"

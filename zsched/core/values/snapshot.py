@@ -164,6 +164,8 @@ class TaskStatus(Struct, frozen=True, kw_only=True):
     streams: tuple[StreamCount, ...] = ()
     history: tuple[PastAllocation, ...] = ()
     problems: tuple[str, ...] = ()
+    problem_kinds: tuple[str, ...] = ()
+    """Which problem each of those is (`zsched.core.values.problems.Problem`); an older program does not say."""
     round_trips: tuple[tuple[NodeId, float], ...] = ()
     """(node, seconds from the answering node to it and back), of a task with a deadline."""
     pause: HoldStatus | None = None
@@ -239,6 +241,8 @@ class Snapshot(Struct, frozen=True, kw_only=True):
     """Where applications on this machine join its streams: zenoh endpoints for a client to dial."""
     counters: tuple[tuple[str, int], ...] = ()
     problems: tuple[str, ...] = ()
+    problem_kinds: tuple[str, ...] = ()
+    """As `TaskStatus.problem_kinds`."""
     frames_dropped_s: float | None = None
     """Seconds since the newest invalid frame, ``None`` when none has come."""
     dropped_ages: tuple[tuple[str, float], ...] = ()

@@ -29,15 +29,9 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import TOLD_DIGITS, Creation, Elector, FleetValue, terms_of
 from zsched.core.values.fleet import Fleet, TaskSpec, Timing
 from zsched.core.values.lease import hold_s
-from zsched.core.values.messages import (
-    Accepted,
-    FleetQuestion,
-    Learnt,
-    Promise,
-    Refused,
-    votes_of,
-)
+from zsched.core.values.messages import Accepted, FleetQuestion, Learnt, Promise, Refused, votes_of
 from zsched.core.values.model import NO_BALLOT, Allocation, NodeId, RegisterState, TaskId
+from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.struct import replace
 from zsched.core.values.words import CREATION_STEP, shown
 from zsched.core.vote.acceptor import Acceptor
@@ -110,14 +104,14 @@ class Agreement:
         )
         self.voted = set() if durable is None else set(durable.voted)
         is_elector = durable is not None and me in fleet.electors and not self._disputed and not self._lost
-        self._problems: dict[str, str] = {}
+        self._problems: dict[ProblemKey, str] = {}
         self.behind: dict[NodeId, tuple[int, float, float]] = {}
         """{node of another generation: (that one, since when it says so, when it last did)}; each has its problem."""
         if durable is not None and self._lost:
             value = None if durable.fleet_register is None else durable.fleet_register.learnt
             self._complain_of_loss(is_agreed=value is not None and bool(value.document))
         if self._disputed:
-            self._problems["state"] = f"{self._disputed}; no elector until {SETTLE}"
+            self._problems[Problem.STATE, ""] = f"{self._disputed}; no elector until {SETTLE}"
         self.counters: Counter[str] = Counter()
         # A state of today's names no creations: its registers are those of its generation.
         held = () if durable is None else durable.registers
@@ -279,11 +273,12 @@ class Agreement:
         return self.acceptor.is_elector
 
     @property
-    def problems(self) -> dict[str, str]:
-        """{subject: why agreement does not work here as it should}."""
-        stuck = {f"register/{name}": register.problem for name, register in self.registers.items() if register.problem}
-        strangers = self.strangers.problems(self._numbers.value)
-        return {**self._problems, **self._numbers.problems, **strangers, **stuck}
+    def problems(self) -> dict[ProblemKey, str]:
+        """{(kind, subject): why agreement does not work here as it should}."""
+        stuck = {("register", name): register.problem for name, register in self.registers.items() if register.problem}
+        strangers = self.strangers.problems(self._numbers.value).items()
+        apart: dict[ProblemKey, str] = {(Problem.GENERATION, node): text for node, text in strangers}
+        return {**self._problems, **self._numbers.problems, **apart, **stuck}
 
     def values(self) -> Mapping[TaskId, Allocation]:
         """{task: the newest learnt value}; a new mapping whenever one changes."""
@@ -458,7 +453,7 @@ class Agreement:
         """A document cannot be used here."""
         self.counters["document_refused"] += 1
         if event.request is None:
-            self._numbers.documents.on_refused(event.document, event.reason, is_of_disk=event.is_of_disk)
+            self._numbers.documents.on_refused(event)
         self.orders.on_refused(event, todo)
 
     def retry_documents(self) -> None:
@@ -590,7 +585,7 @@ class Agreement:
             self._lost = ""  # as any other member it begins blank
             todo.must_persist = True
             if not self._disputed and self._durable is not None:
-                self._problems.pop("state", None)
+                self._problems.pop((Problem.STATE, ""), None)
                 self._numbers.roll.may_elect_again(todo)
         elif self._lost and not self._disputed and self._durable is not None:
             self._complain_of_loss(is_agreed=bool(self.document_hash))
@@ -716,15 +711,14 @@ class Agreement:
             return True
         told, since, _ = self.behind.get(node, (generation, now, now))
         self.behind[node] = generation, since if told == generation else now, now
-        self._problems[f"generation/{node}"] = (
-            f"{node} is of generation {generation}, this node of {self.generation or 0}"
-        )
+        text = f"{node} is of generation {generation}, this node of {self.generation or 0}"
+        self._problems[Problem.GENERATION, node] = text
         return False
 
     def _show_no_more(self, node: NodeId) -> None:
         """A node is not of another generation, or nothing is heard or known of it any more."""
         if self.behind.pop(node, None) is not None:
-            self._problems.pop(f"generation/{node}", None)
+            self._problems.pop((Problem.GENERATION, node), None)
 
     def forget(self, now: float) -> None:
         """Nodes of other generations that are not heard any more are not shown."""
@@ -754,7 +748,7 @@ class Agreement:
         if self._disputed:
             return
         self._disputed = reason
-        self._problems["state"] = f"{reason}; no elector until {SETTLE}"
+        self._problems[Problem.STATE, ""] = f"{reason}; no elector until {SETTLE}"
         self._stop_electing()
         todo.must_persist |= self._durable is not None
 
@@ -771,7 +765,7 @@ class Agreement:
         """Say that this node is no elector, and until when: by an agreed document another disk is another member."""
         lost = lost_text(self._lost, is_agreed=is_agreed)
         joins = "" if self._durable is None else self._durable.joins
-        self._problems["state"] = lost if not joins else moved_text(self._lost, joins)
+        self._problems[Problem.STATE, ""] = lost if not joins else moved_text(self._lost, joins)
 
     def compare(self, beat: Beat, todo: ToDo, now: float) -> None:
         """A peer's beat may show that it has learnt more than we have, or has voted: then ask it."""
@@ -868,7 +862,7 @@ class Agreement:
 
     def on_persist_failed(self, reason: str) -> None:
         """The disk refused: no elector any more, and nothing is written any more."""
-        self._problems["state"] = f"{reason}; this node is no elector until it is restarted"
+        self._problems[Problem.STATE, ""] = f"{reason}; this node is no elector until it is restarted"
         self._durable = None
         self._stop_electing()
 

@@ -8,7 +8,9 @@ from support.fleet_values import fleet_value_of
 from support.fleets import fleet_of
 from zsched.core import instructions as do
 from zsched.core.electorate.documents import FETCH_EVERY_S, MAX_WANTED, Documents
+from zsched.core.events import DocumentRefused
 from zsched.core.todo import ToDo
+from zsched.core.values.problems import Problem
 from zsched.core.values.struct import replace
 
 VALUE = fleet_value_of()
@@ -25,16 +27,16 @@ def test_documents_that_are_not_valid_here_are_asked_for_once_each() -> None:
     """Two in turn: the second one's refusal must not make the first one new again."""
     documents = Documents("robot1", {})
     assert asked(documents, "a", "b") == ["a", "b"]
-    documents.on_refused("a", "an unknown key")
-    documents.on_refused("b", "another one")
+    documents.on_refused(DocumentRefused(document="a", reason="an unknown key"))
+    documents.on_refused(DocumentRefused(document="b", reason="another one"))
     assert asked(documents, "a", "b", "a") == []
-    assert list(documents.refused.values())[-1] == "another one", "the newest is shown"
+    assert list(documents.refused.values())[-1] == (Problem.DOCUMENT, "another one"), "the newest is shown"
 
 
 def test_a_document_that_the_disk_has_refused_is_asked_for_again_until_it_is_stored() -> None:
     documents = Documents("robot1", {})
     assert asked(documents, "a") == ["a"]
-    documents.on_refused("a", "the disk is full", is_of_disk=True)
+    documents.on_refused(DocumentRefused(document="a", reason="the disk is full", is_of_disk=True))
     assert (documents.refused, documents.unwritten) == ({}, {"a": "the disk is full"})
     assert documents.next_deadline() == FETCH_EVERY_S
     todo = ToDo()
@@ -47,8 +49,8 @@ def test_a_document_that_the_disk_has_refused_is_asked_for_again_until_it_is_sto
 def test_a_refused_document_that_no_peer_was_asked_for_is_no_agreed_one() -> None:
     """It is an agreed document that was written once more without the flags whose time is over."""
     documents = Documents("robot1", {})
-    documents.on_refused("a", "the disk is full", is_of_disk=True)
-    documents.on_refused("b", "an unknown key")
+    documents.on_refused(DocumentRefused(document="a", reason="the disk is full", is_of_disk=True))
+    documents.on_refused(DocumentRefused(document="b", reason="an unknown key"))
     assert (documents.refused, documents.unwritten) == ({}, {})
     assert asked(documents, "a", "b") == ["a", "b"], "another node may agree it"
 
@@ -58,7 +60,7 @@ def test_documents_that_the_disk_refuses_do_not_fill_the_memory() -> None:
     names = [f"d{number}" for number in range(MAX_WANTED + 2)]
     for name in names:
         asked(documents, name)
-        documents.on_refused(name, "the disk is full", is_of_disk=True)
+        documents.on_refused(DocumentRefused(document=name, reason="the disk is full", is_of_disk=True))
     assert list(documents.unwritten) == names[2:]
 
 
@@ -67,7 +69,7 @@ def test_refused_documents_do_not_fill_the_memory() -> None:
     names = [f"d{number}" for number in range(MAX_WANTED + 2)]
     for name in names:
         asked(documents, name)
-        documents.on_refused(name, "an unknown key")
+        documents.on_refused(DocumentRefused(document=name, reason="an unknown key"))
     assert list(documents.refused) == names[2:]
 
 

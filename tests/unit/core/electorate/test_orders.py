@@ -38,6 +38,7 @@ from zsched.core.values.messages import (
     fleet_question,
 )
 from zsched.core.values.model import Acceptance, Asked, Ballot, RegisterState
+from zsched.core.values.problems import Problem
 from zsched.core.values.words import MAX_ASKED, MAX_ASKER
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 
@@ -247,6 +248,15 @@ def test_the_document_of_an_accepted_value_stays_however_many_others_come() -> N
     assert len(kept.documents) == 1 + RECENT
 
 
+def test_a_document_that_names_this_node_no_more_is_another_problem() -> None:
+    agreement = make()
+    asked(agreement, prepare_of())
+    asked(agreement, accept_of(ADOPT.apply(FIRST)))
+    agreement.on_refused(ev.DocumentRefused(document="0d", reason="you are not in it", is_taken_out=True), ToDo())
+    assert "you are not in it" in agreement.problems[Problem.TAKEN_OUT, ""]
+    assert (Problem.DOCUMENT, "") not in agreement.problems
+
+
 def test_a_value_is_refused_for_good_while_its_document_is_not_valid_here() -> None:
     agreement = make()
     asked(agreement, prepare_of())
@@ -256,10 +266,10 @@ def test_a_value_is_refused_for_good_while_its_document_is_not_valid_here() -> N
     assert answer is not None
     assert answer.refused is not None
     assert of(todo, do.FetchDocument) == []
-    assert "no robot" in agreement.problems["fleet/document"]
+    assert "no robot" in agreement.problems[Problem.DOCUMENT, ""]
     assert agreement.counters["document_refused"] == 1
     agreement.retry_documents()
-    assert "no robot" not in agreement.problems.get("fleet/document", "")
+    assert "no robot" not in agreement.problems.get(("fleet/document", ""), "")
     assert of(asked(agreement, accept_of(ADOPT.apply(FIRST)))[0], do.FetchDocument), "the file here has changed"
 
 
@@ -274,12 +284,12 @@ def test_a_learnt_value_is_followed_once_the_disk_takes_its_document() -> None:
     (fetch,) = of(todo, do.FetchDocument)
     full = ev.DocumentRefused(document="0d", reason="free or remount the disk", is_of_disk=True)
     agreement.on_refused(full, ToDo())
-    assert "cannot be stored here" in agreement.problems["fleet/document"]
-    assert agreement.problems["fleet/document"].endswith(": free or remount the disk")
+    assert "cannot be stored here" in agreement.problems["fleet/document", ""]
+    assert agreement.problems["fleet/document", ""].endswith(": free or remount the disk")
     assert of(agreed(agreement.tick, 103.2), do.FetchDocument) == [fetch]
     agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 104.0)
     assert agreement.fleet_value == value
-    assert "fleet/document" not in agreement.problems
+    assert ("fleet/document", "") not in agreement.problems
 
 
 def test_a_learnt_value_is_followed_once_its_document_is_stored_and_asked_for_until_then() -> None:
@@ -339,7 +349,7 @@ def test_a_value_whose_document_goes_while_its_round_runs_is_followed_once_that_
     agreement, value = make(ADOPTED, {"0d": FLEET}), replace(ADOPTED, document="0e", revision=3)
     todo = learns_what_goes(agreement, value, SAID)
     assert (agreement.fleet_value, todo.in_force) == (value, None)
-    assert "this node asks its peers" in agreement.problems["fleet/document"]
+    assert "this node asks its peers" in agreement.problems["fleet/document", ""]
     assert [one.document for one in of(todo, do.FetchDocument)] == ["0e"]
     todo = agreed(agreement.on_stored, ev.DocumentStored(document="0e", fleet=SAID), 100.5)
     assert (todo.in_force, agreement.problems) == (in_force(SAID, value), {})
@@ -383,7 +393,7 @@ def test_what_is_known_here_is_kept_on_disk_and_older_ones_go() -> None:
 def test_a_node_that_has_lost_its_document_goes_on_and_asks_for_it() -> None:
     agreement = make(ADOPTED, {})
     assert [one.document for one in of(agreement.at_start, do.FetchDocument)] == ["0d"]
-    assert "not on this disk" in agreement.problems["fleet/document"]
+    assert "not on this disk" in agreement.problems["fleet/document", ""]
     todo = agreed(agreement.on_stored, ev.DocumentStored(document="0d", fleet=SAID), 100.2)
     assert todo.in_force == in_force(SAID, ADOPTED)
     assert agreement.problems == {}

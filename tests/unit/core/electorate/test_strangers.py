@@ -114,20 +114,20 @@ def test_a_stranger_is_shown_with_whom_it_follows_and_what_brings_it_over() -> N
     todo = ToDo()
     assert one.is_stranger(beat(RIGHT, sequence=2), todo, 110.0)
     assert not todo.send, "it is known by whom"
-    shown = one.problems["generation/robot3"]
+    shown = one.problems["generation", "robot3"]
     assert "robot3 counts by another generation of this fleet, bbbbbbbb (recovered by robot3)" in shown
     assert "this node by aaaaaaaa (recovered by robot1)" in shown
     assert "`zsched rejoin aaaaaaaa` there" in shown
     assert "`zsched rejoin bbbbbbbb` here" in shown
     assert not one.is_stranger(beat(LEFT, sequence=3), ToDo(), 110.1)
-    assert "generation/robot3" not in one.problems
+    assert ("generation", "robot3") not in one.problems
 
 
 def test_a_stranger_that_is_not_heard_any_more_is_not_shown() -> None:
     one = agreement()
     one.is_stranger(beat(RIGHT), ToDo(), 100.0)
     one.forget(100.0 + SHOWN_S)
-    assert "generation/robot3" not in one.problems
+    assert ("generation", "robot3") not in one.problems
 
 
 @pytest.mark.parametrize(("theirs", "subject"), [(RIGHT, "generation/robot9"), (LEFT, "fleet/robot9")])
@@ -277,7 +277,7 @@ def test_who_is_to_join_takes_the_first_word_of_that_generation_only() -> None:
     assert state.joins == LEFT.generation_id
     one = agreement(None, "robot3", state)
     assert (one.is_elector, one.number, one.disk) == (False, 0, "")
-    assert MOVED in one.problems["state"]
+    assert MOVED in one.problems["state", ""]
     assert one.is_stranger(beat(RIGHT, "robot2"), ToDo(), 100.0)
     agreed(one.on_learnt, told(RIGHT, ALLOCATION, sender="robot2"), 100.1)
     assert one.number == 0
@@ -287,7 +287,7 @@ def test_who_is_to_join_takes_the_first_word_of_that_generation_only() -> None:
     assert [ask.peer for ask in todo.send if isinstance(ask, do.AskLearnt)] == ["robot1"]
     agreed(one.on_learnt, told(LEFT, sender="robot1"), 100.3)
     assert (one.fleet_value, one.disk, one.is_elector) == (LEFT, "99", False)
-    assert "state" not in one.problems
+    assert ("state", "") not in one.problems
     kept = one.to_persist(100.4)
     assert kept is not None
     assert agreement(None, "robot3", kept).fleet_value == LEFT

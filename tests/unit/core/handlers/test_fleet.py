@@ -168,10 +168,10 @@ def test_a_file_of_somebody_else_is_refused_and_told(changed: Fleet, why: str) -
     node = node_of(FLEET)
     node.start(START)
     assert do.AdoptFleet not in kinds(adopt(node, changed))
-    assert why in node.problems["fleet"]
+    assert why in node.problems["fleet", ""]
     assert node.fleet == FLEET
     adopt(node, FLEET)
-    assert "fleet" not in node.problems
+    assert ("fleet", "") not in node.problems
 
 
 def test_a_task_that_goes_ends_and_comes_back_with_what_it_had_promised() -> None:

@@ -195,7 +195,7 @@ def test_electors_of_more_exclusive_tasks_than_a_beat_has_room_for_stay_alive_an
     assert all(until > sim.now for _, until in sim.working.values())
     node = sim.node(ROBOTS[0])
     assert node.counters["beat_parts_left_out"] > 0
-    assert "no room in a beat" in node.problems["beat"]
+    assert "no room in a beat" in node.problems["beat", ""]
 
 
 def test_a_node_whose_beats_have_no_room_says_so_until_they_have() -> None:
@@ -211,10 +211,10 @@ def test_a_node_whose_beats_have_no_room_says_so_until_they_have() -> None:
     batch = *node.start(100.0), *node.handle(ev.DeadlineReached(), 100.2)
     left_out = [200 - len(one.beat.learnt) for one in batch if isinstance(one, do.PublishBeat)]
     assert node.counters["beat_parts_left_out"] == sum(left_out) > 0
-    assert node.problems["beat"].startswith(f"{left_out[-1]} parts have no room in a beat")
+    assert node.problems["beat", ""].startswith(f"{left_out[-1]} parts have no room in a beat")
     node.handle(ev.FleetChanged(fleet=fleet(20, 63)), 100.3)
     node.handle(ev.DeadlineReached(), 100.5)
-    assert "beat" not in node.problems
+    assert ("beat", "") not in node.problems
 
 
 TEXT = """

@@ -253,7 +253,7 @@ def test_two_values_for_one_revision_are_a_problem_that_is_shown() -> None:
         agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(3, "robot2"),))), 100.0).learnt
         == []
     )
-    assert "two values for revision 3" in agreement.problems["register/merge"]
+    assert "two values for revision 3" in agreement.problems["register", "merge"]
     assert (
         agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(4, "robot2"),))), 100.1).learnt
         != []
@@ -441,7 +441,7 @@ def test_refused_write_ends_the_electorship_and_the_writing() -> None:
     agreement.on_persist_failed("disk full")
     assert not agreement.is_elector
     assert agreement.to_persist(100.0) is None
-    assert agreement.problems == {"state": "disk full; this node is no elector until it is restarted"}
+    assert agreement.problems == {("state", ""): "disk full; this node is no elector until it is restarted"}
     ballot = ballot_of(node="robot2")
     effects = agreed(
         agreement.acceptor.on_prepare,
@@ -560,7 +560,7 @@ def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
     assert "another daemon" in state.disputed
     again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=0.0)
     assert not again.is_elector
-    assert "--settle" in again.problems["state"]
+    assert "--settle" in again.problems["state", ""]
 
 
 def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> None:
@@ -569,15 +569,17 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
     lost = replace(state, lost="peers remember 9 votes, here are 3")
     again = Agreement(fleet=FLEET, me="robot1", durable=lost, incarnation=8, electorate="e", rng=Random(1), now=0.0)
     assert not again.is_elector
-    assert again.problems["state"].startswith("peers remember 9 votes, here are 3: it was brought back from a backup")
-    assert "zsched init --help" in again.problems["state"]
+    assert again.problems["state", ""].startswith(
+        "peers remember 9 votes, here are 3: it was brought back from a backup"
+    )
+    assert "zsched init --help" in again.problems["state", ""]
     kept = again.to_persist(100.0)
     assert kept is not None
     assert kept.lost == lost.lost
     value = replace(founded(FLEET.name, 0, FLEET.electors), document="0d", revision=3)
     agreed = replace(lost, fleet_register=RegisterState(task=FLEET.name, learnt=value))
     other = Agreement(fleet=FLEET, me="robot1", durable=agreed, incarnation=8, electorate="e", rng=Random(1), now=0.0)
-    assert other.problems["state"].endswith("which `electorate: auto` does by itself once its old seat is given up")
+    assert other.problems["state", ""].endswith("which `electorate: auto` does by itself once its old seat is given up")
 
 
 def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> None:
@@ -585,9 +587,9 @@ def test_another_generation_teaches_nothing_and_is_shown_until_it_is_gone() -> N
     told_by = Learnt(node="robot2", values=(allocation_of(2**32, None),), generation=1)
     assert agreed(agreement.on_learnt, answer(told_by), 100.0) == ToDo()
     assert agreement.registers["merge"].value.revision == 0
-    assert "generation 1" in agreement.problems["generation/robot2"]
+    assert "generation 1" in agreement.problems["generation", "robot2"]
     agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(allocation_of(3),))), 100.0)
-    assert "generation/robot2" not in agreement.problems
+    assert ("generation", "robot2") not in agreement.problems
     assert agreement.registers["merge"].value.revision == 3
 
 
@@ -596,11 +598,11 @@ def test_another_generation_is_shown_until_it_is_silent_or_out_of_the_file() -> 
     other = answer(Learnt(node="edge1", values=(), generation=1))
     agreed(agreement.on_learnt, other, 100.0)
     agreement.forget(100.0 + SHOWN_S - 0.1)
-    assert "generation/edge1" in agreement.problems
+    assert ("generation", "edge1") in agreement.problems
     agreement.forget(100.0 + SHOWN_S)
     assert agreement.problems == {}
     agreed(agreement.on_learnt, other, 200.0)
-    assert "generation/edge1" in agreement.problems
+    assert ("generation", "edge1") in agreement.problems
     agreement.adopt(fleet_of(task_of("merge", ("robot2",)), of=ROBOTS, electors=ROBOTS), ToDo(), 200.1)
     assert agreement.problems == {}
 
@@ -661,7 +663,7 @@ def test_a_node_with_a_state_follows_nobody() -> None:
     agreement = make()
     agreed(agreement.on_learnt, answer(Learnt(node="robot2", values=(), generation=3, incarnation=5)), 100.0)
     assert agreement.generation == 0
-    assert "generation 3" in agreement.problems["generation/robot2"]
+    assert "generation 3" in agreement.problems["generation", "robot2"]
 
 
 def test_revision_that_nothing_could_follow_is_refused_and_shown() -> None:

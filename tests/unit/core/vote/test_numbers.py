@@ -398,7 +398,7 @@ def test_a_fleet_value_whose_tasks_could_have_no_register_is_not_learnt() -> Non
         said = Learnt(node="robot2", values=(), generation=GENERATION, fleet=told)
         agreed(agreement.on_learnt, ev.LearntReceived(learnt=said, is_answer=True), 100.1)
         assert (agreement.number == 3) is is_learnt
-        assert ("fleet/register" in agreement.problems) is not is_learnt
+        assert (("fleet/register", "") in agreement.problems) is not is_learnt
 
 
 def test_a_fleet_value_whose_tasks_are_not_its_document_s_is_not_learnt() -> None:
@@ -524,8 +524,8 @@ def test_who_has_lost_its_state_and_gets_another_seat_elects_if_nothing_else_for
         agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.2)
     assert agreement.fleet_value == back
     assert agreement.is_elector is not bool(why)
-    assert ("state" in agreement.problems) is bool(why)
-    assert why in agreement.problems.get("state", "")
+    assert (("state", "") in agreement.problems) is bool(why)
+    assert why in agreement.problems.get(("state", ""), "")
     after = agreement.to_persist(100.3)
     assert (after is None) is (why == "the disk is full")
     assert after is None or (after.lost, after.disputed) == ("", disputed)
