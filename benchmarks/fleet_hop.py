@@ -25,6 +25,7 @@ from typing import Any
 import psutil
 
 from benchmarks.common import cpu_s, machine
+from zsched.core.values.problems import of_kind
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
@@ -105,7 +106,7 @@ def _row(size: int, stream_class: str, setting: str, options: argparse.Namespace
         bed.init()
         bed.start()
         bed.wait_settled()
-        problems = [text for text in bed.status("robot1")["problems"] if "shared memory" in text]
+        problems = of_kind(bed.status("robot1"), "shared_memory")
         endpoint = bed.fleet.node("robot1").listen_data
         config = client_config(connect=(endpoint,), timing=bed.fleet.timing, shared_memory=setting == "auto")
         command = [sys.executable, "-c", APPLICATION, config, str(size), str(options.hz), str(options.seconds)]

@@ -66,6 +66,6 @@ def parted(*found: Told) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(text for _, text in pairs), tuple(str(kind) for kind, _ in pairs)
 
 
-def of_kind(said: Mapping[str, Any], *kinds: Problem) -> list[str]:
+def of_kind(said: Mapping[str, Any], *kinds: str) -> list[str]:
     """Those sentences in a plain status, or in one of its tasks; none where an older daemon tells no kinds."""
     return [text for text, kind in zip(said["problems"], said.get("problem_kinds", ()), strict=False) if kind in kinds]
