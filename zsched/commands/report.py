@@ -26,7 +26,7 @@ from zsched.commands.page import (
 from zsched.commands.weight_words import shares
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.problems import Problem, of_kind
-from zsched.core.values.words import COUNTED_ANEW, RESTARTING, WAS_READY, has_lost_its_worker, shown, told_of_worker
+from zsched.core.values.words import COUNTED_ANEW, has_lost_its_worker, shown, told_of_worker
 
 Json = dict[str, Any]
 
@@ -44,7 +44,7 @@ WORDS_OF_SECURITY = {"secured": "secured", "encrypted": "TLS", "open": "NOT SECU
 NO_ANSWER_TO = 100
 """After this many inputs without one output, ever, the key of the output is doubted."""
 STATE_STYLES = {"alive": "green", "ready": "green"} | dict.fromkeys(
-    ("draining", "drained", "no new", "starting", RESTARTING, "stopped", "suspect", "unknown"), "yellow"
+    ("draining", "drained", "no new", "starting", "restarting", "stopped", "suspect", "unknown"), "yellow"
 )
 """All others are red."""
 
@@ -70,13 +70,13 @@ def _lack_of_worker(status: Json, task: Json) -> str | None:
     """Why the owner does no work, in the words of the daemon's own problems; ``None`` when it does, or will soon."""
     owner = task["owner"]
     workers = (worker for node in status["nodes"] if node["name"] == owner for worker in node["workers"])
-    loads = ((one["state"], one.get("reason") or "") for one in workers if one["task"] == task["name"])
-    state, why = next(loads, ("", ""))
-    if not has_lost_its_worker(state, why):
+    load: Json = next((one for one in workers if one["task"] == task["name"]), {})
+    state, trouble, why = (str(load.get(key) or "") for key in ("state", "trouble", "reason"))
+    if not has_lost_its_worker(state, trouble):
         return None
     because = f": {why}" if why else ""
     if state != "failed":
-        return f"the worker on {owner} {told_of_worker(state, why)}"
+        return f"the worker on {owner} {told_of_worker(state, trouble, why)}"
     return f"the worker on {owner} failed{because}; mend it, then `zsched restart {task['name']} {owner}`"
 
 
@@ -267,12 +267,11 @@ def _workers(workers: Sequence[Json], room: int, *, is_single: bool) -> Cell:
 def _worker_state(worker: Json) -> str:
     """In a word what the daemon's problems say at length (`told_of_worker`).
 
-    >>> _worker_state({"state": "starting", "reason": "was ready until 12:00:00 UTC, its token went"})
+    >>> _worker_state({"state": "starting", "trouble": "lost"})
     'was ready'
     """
-    state, why = str(worker["state"]), worker.get("reason") or ""  # a later field of the schema's major version
-    begins = (word for word in (WAS_READY.removesuffix(" until "), RESTARTING) if why.startswith(word))
-    return state if state == "ready" else next(begins, state)
+    words = {"lost": "was ready", "again": "restarting"}
+    return words.get(worker.get("trouble", ""), str(worker["state"]))  # a later field of the schema's major version
 
 
 def _gateway(page: Page, nodes: Sequence[Json]) -> None:

@@ -39,7 +39,7 @@ from zsched.core.values.plan import DrainingSlot, StreamCount
 from zsched.core.values.profile import DeviceSample, LinkSample, Profile, WorkerState
 from zsched.core.values.rehearsal import KeepRehearsal, ReadRehearsals, Strike
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import check_range
+from zsched.core.values.words import Trouble, check_range
 
 
 class DeadlineReached(Struct, frozen=True, kw_only=True):
@@ -243,6 +243,7 @@ class WorkerChanged(Struct, frozen=True, kw_only=True):
     task: TaskId
     state: WorkerState
     reason: str = ""
+    trouble: Trouble = Trouble.NONE
 
 
 class WorkerTroubled(Struct, frozen=True, kw_only=True):

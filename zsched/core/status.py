@@ -43,7 +43,7 @@ from zsched.core.values.snapshot import (
     VoteStatus,
 )
 from zsched.core.values.struct import replace
-from zsched.core.values.words import RESTARTING, WAS_READY, shown, told_of_worker
+from zsched.core.values.words import Trouble, shown, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
 
@@ -534,7 +534,7 @@ def _task_problems(node: Stages, task: TaskSpec, value: Allocation, now: float) 
         elif (name == server and load.state is not WorkerState.READY) or (
             _is_in_the_way(task, load) and (owner is None or _may_follow(node, task, profile, server))
         ):
-            yield f"the worker on {name} {told_of_worker(load.state, load.reason)}"
+            yield f"the worker on {name} {told_of_worker(load.state, load.trouble, load.reason)}"
         elif load.state is WorkerState.READY and load.reason:
             yield f"the worker on {name}{why}"
         late_ratio = None if load.jobs is None else load.jobs.late_ratio
@@ -597,7 +597,7 @@ def _is_in_the_way(task: TaskSpec, load: WorkerLoad) -> bool:
     Missed is one that somebody else has to start.
     """
     is_missed = not task.worker.command and load.state is WorkerState.STOPPED and bool(load.reason)
-    return is_missed or (load.state is not WorkerState.READY and load.reason.startswith((RESTARTING, WAS_READY)))
+    return is_missed or load.trouble in (Trouble.LOST, Trouble.AGAIN)
 
 
 def _heard(node: Stages, now: float) -> Iterator[Profile]:
@@ -637,7 +637,7 @@ def _no_spare(node: Stages, task: TaskSpec, value: Allocation, owner: NodeId, no
         elif load is None:
             untold.append(f"{profile.node} runs no worker for it")
         elif not is_told:  # why the others cannot stands in lines of their own
-            untold.append(f"the worker on {profile.node} {told_of_worker(load.state, load.reason)}")
+            untold.append(f"the worker on {profile.node} {told_of_worker(load.state, load.trouble, load.reason)}")
     if is_missed:
         yield f"{NO_SPARE}: {'; '.join(untold)}" if untold else NO_SPARE
 

@@ -129,7 +129,7 @@ def _lost_workers(status: Json, task: Json) -> Iterator[Result]:
     """That the owner of a task does no work, as far as this node knows."""
     for node in status["nodes"]:
         for load in node["workers"] if node["name"] == task["owner"] else ():
-            state, reason = str(load["state"]), str(load.get("reason") or "")
-            if load["task"] == task["name"] and has_lost_its_worker(state, reason):
-                told = f"{task['name']}: the worker of its owner {task['owner']} {told_of_worker(state, reason)}"
+            state, trouble, why = (str(load.get(key) or "") for key in ("state", "trouble", "reason"))
+            if load["task"] == task["name"] and has_lost_its_worker(state, trouble):
+                told = f"{task['name']}: the worker of its owner {task['owner']} {told_of_worker(state, trouble, why)}"
                 yield failed(told, fix=f"zsched logs {task['name']} --node {task['owner']} shows what it printed")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from zsched.core.values.fleet import TaskSpec, runs_worker
-from zsched.core.values.words import RESTARTING, WAS_READY, has_lost_its_worker, told_of_worker
+from zsched.core.values.words import Trouble, told_of_worker
 from zsched.doctor.model import Json, Result, Scene, failed, joined, passed, skipped, warned
 from zsched.doctor.service import path_of_service, starter_of_service, user_of_service
 from zsched.drivers import container, ros2_lifecycle, systemd
@@ -196,14 +196,13 @@ def run_well(scene: Scene) -> Result:
 
 
 def _worker(node: str, load: Json) -> Result:
-    task, state, reason = str(load["task"]), str(load["state"]), str(load.get("reason") or "")
-    told = f"the worker of {task} {told_of_worker(state, reason)}"
+    task, state, trouble, reason = (str(load.get(key) or "") for key in ("task", "state", "trouble", "reason"))
+    told = f"the worker of {task} {told_of_worker(state, trouble, reason)}"
     if state == "failed":
         return failed(told, fix=f"mend its cause, then: zsched restart {task} {node}")
-    if has_lost_its_worker(state, reason) and state != "stopped":
-        return failed(told, fix=f"zsched logs {task} {node}; zsched restart {task} {node} starts it anew")
-    if state == "stopped" and reason.startswith(WAS_READY):
-        return failed(told, fix="somebody else starts it: do so as the line says")
-    if reason.startswith(RESTARTING) or (state == "ready" and reason):
+    if trouble == Trouble.LOST:
+        anew = f"zsched logs {task} {node}; zsched restart {task} {node} starts it anew"
+        return failed(told, fix=anew if state == "starting" else "somebody else starts it: do so as the line says")
+    if trouble == Trouble.AGAIN or (state == "ready" and reason):
         return warned(told, fix=f"zsched logs {task} {node} shows what it printed")
     return passed(told)

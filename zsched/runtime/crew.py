@@ -21,7 +21,7 @@ from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.profile import WorkerState
-from zsched.core.values.words import WAS_READY
+from zsched.core.values.words import Trouble
 from zsched.guard import guarded
 from zsched.runtime.sessions import SessionsRead
 from zsched.wire.keyspace import Keyspace, counter
@@ -218,11 +218,8 @@ class Crew:
         """A worker here says that its callbacks raise, for one; of a process that has ended that is no news."""
         with self._lock:
             if self._is_of(trouble.task, trouble.incarnation):
-                self._post(
-                    ev.WorkerTroubled(
-                        task=trouble.task, count=trouble.count, text=trouble.text, is_cold=trouble.is_cold
-                    )
-                )
+                task, count, text = trouble.task, trouble.count, trouble.text
+                self._post(ev.WorkerTroubled(task=task, count=count, text=text, is_cold=trouble.is_cold))
 
     def is_ours(self, jobs: ev.WorkerJobs) -> bool:
         """Whether that is the word of a worker that runs here, or of one that somebody else started."""
@@ -263,15 +260,15 @@ class Crew:
             self._lost.pop(task, None)
             self._post(ev.WorkerChanged(task=task, state=WorkerState.READY, reason=reason))
             return
-        is_ours = task in self._lives
+        is_ours, trouble = task in self._lives, Trouble.NONE
         if is_ours and (again := self._why_again(task)):
-            reason = again if reason in again else f"{again}; now {reason}"
+            trouble, reason = Trouble.AGAIN, again if reason in again else f"{again}; now {reason}"
         if task in self._seen and not (is_ours and supervisor.states().get(task) is WorkerState.STOPPED):
-            reason = self._lost.setdefault(task, self._not_any_more(task, reason))
+            trouble, reason = Trouble.LOST, self._lost.setdefault(task, self._not_any_more(task, reason))
         elif task in self._foreign:
             reason = f"{reason}: {self._start_it(task)}"
         state = WorkerState.STARTING if is_ours else WorkerState.STOPPED
-        self._post(ev.WorkerChanged(task=task, state=state, reason=reason))
+        self._post(ev.WorkerChanged(task=task, state=state, trouble=trouble, reason=reason))
 
     def _look_what_it_has_read(self, task: TaskId, life: int) -> None:
         """Whether somebody else's worker, which is there, goes on with a session of before; say so, or take it back."""
@@ -300,7 +297,7 @@ class Crew:
         return was_away and monotonic_s() - self._relay_at >= REJOIN_S
 
     def _not_any_more(self, task: TaskId, what: str) -> str:
-        since = f"{WAS_READY}{wall_time()[11:19]} UTC, {what}"
+        since = f"was ready until {wall_time()[11:19]} UTC, {what}"
         if task in self._foreign:
             return f"{since}: it has ended, hangs or is frozen; {self._start_it(task, 'start it again')}"
         pid = None if self.supervisor is None else self.supervisor.pids().get(task)
@@ -322,8 +319,8 @@ class Crew:
             self._forget(task)
             again = self._why_again(task)
             longer = f"{again}; now it is pid {pid}" if again else f"pid {pid}"
-            reason = longer if len(longer) <= MAX_REASON else again
-            self._post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, reason=reason))
+            reason, trouble = longer if len(longer) <= MAX_REASON else again, Trouble.AGAIN if again else Trouble.NONE
+            self._post(ev.WorkerChanged(task=task, state=WorkerState.STARTING, trouble=trouble, reason=reason))
             match = self._matches.get(task)
             if match is not None and match.is_matched and self.supervisor is not None:
                 self._tell(self.supervisor, task, incarnation, is_ready=True, reason="it matches already")
@@ -333,12 +330,13 @@ class Crew:
 
     def on_exited(self, task: TaskId, incarnation: int, returncode: int, reason: str) -> None:
         """The supervisor: a worker process has ended."""
-        detail = self._why_again(task) or reason or f"exit code {returncode}"
+        again = self._why_again(task)
+        trouble, detail = Trouble.AGAIN if again else Trouble.NONE, again or reason or f"exit code {returncode}"
         with self._lock:
             if self._lives.get(task) == incarnation:
                 self._lives[task] = 0
                 self._forget(task)
-                self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, reason=detail))
+                self._post(ev.WorkerChanged(task=task, state=WorkerState.STOPPED, trouble=trouble, reason=detail))
 
     def _why_again(self, task: TaskId) -> str:
         return "" if self.supervisor is None else self.supervisor.why_again(task)

@@ -20,7 +20,7 @@ from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.profile import WorkerState
-from zsched.core.values.words import WAS_READY, told_of_worker
+from zsched.core.values.words import Trouble, told_of_worker
 from zsched.runtime import crew as crew_module
 from zsched.runtime.crew import OTHERS, Crew
 from zsched.runtime.sessions import SessionsRead
@@ -60,6 +60,14 @@ class House:
 
     def reasons(self, task: str) -> list[str]:
         return [one.reason for one in tuple(self.events) if isinstance(one, ev.WorkerChanged) and one.task == task]
+
+    def troubles(self, task: str) -> list[Trouble]:
+        return [one.trouble for one in tuple(self.events) if isinstance(one, ev.WorkerChanged) and one.task == task]
+
+    def told(self, task: str) -> list[str]:
+        """In words, as the status has it."""
+        said = zip(self.states(task), self.troubles(task), self.reasons(task), strict=True)
+        return [told_of_worker(*one) for one in said]
 
     def problems(self) -> list[tuple[str, str | None]]:
         return [(one.source, one.problem) for one in tuple(self.events) if isinstance(one, ev.ProblemReported)]
@@ -153,9 +161,10 @@ def test_a_worker_that_was_ready_is_not_told_what_it_has_done_already(house: Hou
     until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "the supervisor knows")
     house.crew.on_token(replace(seen, is_present=False))
     lost = house.reasons("token")[-1]
-    assert lost.startswith(WAS_READY)
+    assert house.troubles("token")[-1] is Trouble.LOST
+    assert lost.startswith("was ready until ")
     assert lost.endswith(f"its token went: it may hang, be frozen or cut off; see its log and process {pid}")
-    assert told_of_worker(house.states("token")[-1], lost) == lost, "and not that it is starting"
+    assert house.told("token")[-1] == lost, "and not that it is starting"
     until(lambda: f"not ready again within 4 s: {lost}" in str(house.reasons("token")), "the deadline")
     until(lambda: house.crew.life_of("token") not in (0, life), "the next process runs")
     assert "no token" in house.crew.why_not_ready("token"), "which has not been ready"
@@ -171,8 +180,9 @@ def test_a_worker_that_was_killed_is_restarting_and_not_just_starting(house: Hou
     second = house.supervisor.pids()["token"]
     said = "restarting (failure 1 of 3): killed by signal 9 (Killed)"
     assert house.reasons("token")[1:] == [said, f"{said}; now it is pid {second}"]
-    told = [told_of_worker(*one) for one in zip(house.states("token"), house.reasons("token"), strict=True)]
-    assert told == [f"is starting: pid {first}", f"is {said}", f"is {said}; now it is pid {second}"]
+    assert house.troubles("token") == [Trouble.NONE, Trouble.AGAIN, Trouble.AGAIN]
+    told = [f"is starting: pid {first}", f"is {said}", f"is {said}; now it is pid {second}"]
+    assert house.told("token") == told
     house.crew.on_token(WorkerSeen(node="edge1", task="token", incarnation=str(again), is_present=True))
     until(lambda: house.supervisor.states()["token"] is WorkerState.READY, "the supervisor knows")
     house.supervisor.stop("token")
@@ -180,12 +190,12 @@ def test_a_worker_that_was_killed_is_restarting_and_not_just_starting(house: Hou
     house.supervisor.start("token")
     until(lambda: house.crew.life_of("token"), "it runs again")
     assert house.reasons("token")[-1].startswith("pid "), "an operator's stop is no failure"
+    assert house.troubles("token")[-3:] == [Trouble.NONE] * 3
 
 
 def test_a_worker_that_is_not_started_again_is_not_restarting(house: House) -> None:
     house.crew.on_stopped("token")
-    (told,) = zip(house.states("token"), house.reasons("token"), strict=True)
-    assert told_of_worker(*told) == "is stopped: stopped before its next start"
+    assert house.told("token") == ["is stopped: stopped before its next start"]
 
 
 def test_a_process_that_is_started_again_and_matches_nobody_is_restarting(house: House) -> None:
@@ -198,6 +208,7 @@ def test_a_process_that_is_started_again_and_matches_nobody_is_restarting(house:
     said = house.reasons("node")[-1]
     assert said.startswith("restarting (failure 1 of 3): not ready within 4 s")
     assert said.count("nobody subscribes to a/key") == 1
+    assert house.troubles("node")[-1] is Trouble.AGAIN
 
 
 def test_what_matches_without_a_process_is_not_the_worker(house: House) -> None:
@@ -219,7 +230,8 @@ def test_somebody_else_s_worker_comes_and_goes_by_matching(house: House) -> None
     never, _, lost = house.reasons("others")
     start_it = "on edge1 (the task has no `command`) with the session edge1-others.zenoh.json5"
     assert never == f"nobody subscribes to a/key: start it {start_it}"
-    assert lost.startswith(WAS_READY)
+    assert house.troubles("others") == [Trouble.NONE, Trouble.NONE, Trouble.LOST]
+    assert lost.startswith("was ready until ")
     assert lost.endswith(f"nobody subscribes to a/key: it has ended, hangs or is frozen; start it again {start_it}")
     assert len(lost) <= MAX_REASON
 

@@ -42,7 +42,7 @@ from zsched.core.values.plan import ReadyWhen, StreamCount
 from zsched.core.values.problems import Problem
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched.core.values.words import RESTARTING, WAS_READY, told_of_worker
+from zsched.core.values.words import Trouble, told_of_worker
 from zsched.core.vote.agreement import Agreement
 from zsched_lab.sim.simulator import Simulator
 
@@ -668,7 +668,7 @@ def test_a_task_without_an_owner_says_which_workers_have_failed_before() -> None
     node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     told_by(node, "edge1", 1, WorkerState.STARTING, "pid 7")
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "it starts"
-    told_by(node, "edge1", 2, WorkerState.STARTING, f"{RESTARTING} (failure 1 of 3): not ready within 20 s")
+    told_by(node, "edge1", 2, WorkerState.STARTING, "restarting (failure 1 of 3): not ready within 20 s", Trouble.AGAIN)
     said = ("the worker on edge1 is restarting (failure 1 of 3): not ready within 20 s",)
     assert build_snapshot(node, 100.0).tasks[0].problems == said
 
@@ -688,27 +688,27 @@ def problems_of(node: Node) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize(
-    ("command", "state", "reason"),
+    ("command", "state", "reason", "trouble"),
     [
-        ((), WorkerState.STOPPED, "no token"),
-        ((), WorkerState.STOPPED, f"{WAS_READY}12:00:00 UTC, its token went: it has ended, hangs or is frozen"),
-        (("work",), WorkerState.STARTING, f"{WAS_READY}12:00:00 UTC, its token went: it may hang"),
-        (("work",), WorkerState.STARTING, f"{RESTARTING} (failure 1 of 3): killed by signal 9"),
-        (("work",), WorkerState.STOPPED, f"{RESTARTING} (failure 1 of 3): killed by signal 9"),
+        ((), WorkerState.STOPPED, "no token", Trouble.NONE),
+        ((), WorkerState.STOPPED, "was ready until 12:00:00 UTC: it has ended, hangs or is frozen", Trouble.LOST),
+        (("work",), WorkerState.STARTING, "was ready until 12:00:00 UTC, its token went: it may hang", Trouble.LOST),
+        (("work",), WorkerState.STARTING, "restarting (failure 1 of 3): killed by signal 9", Trouble.AGAIN),
+        (("work",), WorkerState.STOPPED, "restarting (failure 1 of 3): killed by signal 9", Trouble.AGAIN),
     ],
     ids=["missed", "missed again", "hangs", "restarts", "waits for its restart"],
 )
 def test_a_standby_that_is_away_is_told_of_although_the_task_is_served(
-    command: tuple[str, ...], state: WorkerState, reason: str
+    command: tuple[str, ...], state: WorkerState, reason: str, trouble: Trouble
 ) -> None:
     node = served((*EDGES, "edge3"), WorkerSpec(command=command))
     told_by(node, "edge3", 1, WorkerState.READY)
     told_by(node, "edge2", 1, WorkerState.READY)
     assert problems_of(node) == ()
-    told_by(node, "edge2", 2, state, reason)
-    away = f"the worker on edge2 {told_of_worker(state, reason)}"
+    told_by(node, "edge2", 2, state, reason, trouble)
+    away = f"the worker on edge2 {told_of_worker(state, trouble, reason)}"
     assert problems_of(node) == (away,), "edge3 could take it"
-    told_by(node, "edge3", 2, state, reason)
+    told_by(node, "edge3", 2, state, reason, trouble)
     assert problems_of(node) == (away, away.replace("edge2", "edge3"), "no other candidate can take it")
     assert not degradations(snapshot_json(build_snapshot(node, 100.0))), "it is served"
 
@@ -828,8 +828,9 @@ def test_an_owner_s_worker_that_was_ready_is_not_said_to_be_starting() -> None:
     node = make()
     node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     learn(node, 1, "edge1")
-    told_by(node, "edge1", 1, WorkerState.STARTING, f"{WAS_READY}12:00:00 UTC, its token went: it may hang")
-    said = "the worker on edge1 was ready until 12:00:00 UTC, its token went: it may hang"
+    reason = "was ready until 12:00:00 UTC, its token went: it may hang"
+    told_by(node, "edge1", 1, WorkerState.STARTING, reason, Trouble.LOST)
+    said = f"the worker on edge1 {reason}"
     snapshot = build_snapshot(node, 100.0)
     assert said in snapshot.tasks[0].problems
     assert any(said in reason for reason in degradations(snapshot_json(snapshot)))
@@ -851,11 +852,12 @@ def told_by(
     sequence: int,
     state: WorkerState,
     reason: str = "",
+    trouble: Trouble = Trouble.NONE,
     jobs: Jobs | None = None,
     unended_s: float | None = None,
 ) -> None:
     """A node's profile says how its worker is."""
-    load = load_of(state=state, reason=reason, jobs=jobs, unended_s=unended_s)
+    load = load_of(state=state, trouble=trouble, reason=reason, jobs=jobs, unended_s=unended_s)
     profile = profile_of(name, incarnation=3, sequence=sequence, memory_used_mb=100.0, workers=(load,))
     node.handle(ev.ProfileReceived(profile=profile), 100.0)
 

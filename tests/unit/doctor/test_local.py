@@ -405,14 +405,19 @@ def test_a_worker_that_failed_is_found(tmp_path: Path) -> None:
     ("load", "verdict", "fix"),
     [
         (
-            {"state": "starting", "reason": "was ready until 12:00:00 UTC, its token went: it may hang"},
+            {"state": "starting", "trouble": "lost", "reason": "was ready until 12:00:00 UTC, its token went"},
             FAIL,
             "zsched logs merge edge1; zsched restart merge edge1 starts it anew",
         ),
         (
-            {"state": "stopped", "reason": "was ready until 12:00:00 UTC, its token went: start it again on edge1"},
+            {"state": "stopped", "trouble": "lost", "reason": "was ready until 12:00:00 UTC: start it again on edge1"},
             FAIL,
             "somebody else starts it: do so as the line says",
+        ),
+        (
+            {"state": "starting", "trouble": "again", "reason": "restarting (failure 1 of 3): killed"},
+            WARN,
+            "zsched logs merge edge1 shows what it printed",
         ),
         ({"state": "ready", "reason": "raises: no model file"}, WARN, "zsched logs merge edge1 shows what it printed"),
     ],
@@ -430,11 +435,11 @@ def test_advice_for_a_worker_names_its_node_for_the_owner_s_may_be_well(
 def test_an_owner_whose_worker_hangs_is_found_by_its_node_and_by_the_others(tmp_path: Path) -> None:
     scene = scene_of(tmp_path)
     why = "was ready until 12:00:00 UTC, its token went: it may hang"
-    load = {"task": "merge", "state": "starting", "reason": why}
+    load = {"task": "merge", "state": "starting", "trouble": "lost", "reason": why}
     hung = answer(scene, nodes=[{"name": "edge1", "workers": [load]}])
     assert_finds(run("worker.state", hung), FAIL, f"the worker of merge {why}")
     assert_finds(run("task.owners", hung), FAIL, f"merge: the worker of its owner edge1 {why}")
-    first = answer(scene, nodes=[{"name": "edge1", "workers": [{**load, "reason": ""}]}])
+    first = answer(scene, nodes=[{"name": "edge1", "workers": [{**load, "trouble": "", "reason": ""}]}])
     assert run("worker.state", first).verdict is PASS, "it starts"
     assert run("task.owners", first).verdict is PASS
 

@@ -40,7 +40,6 @@ from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId, as_reason
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.struct import Struct, field
-from zsched.core.values.words import RESTARTING
 from zsched.guard import guarded
 from zsched.sessions.comparison import lacking
 
@@ -613,8 +612,8 @@ class WorkerSupervisor:
 
 def _told_again(reason: str, count: int, most: int) -> str:
     """Which failure is followed by a start; without the count where that would cost the reason its end."""
-    told = f"{RESTARTING} (failure {count} of {most}): {reason}"
-    return told if len(told) <= MAX_REASON else f"{RESTARTING}: {reason}"
+    told = f"restarting (failure {count} of {most}): {reason}"
+    return told if len(told) <= MAX_REASON else f"restarting: {reason}"
 
 
 _LACKS_ROS: Final = re.compile(

@@ -14,8 +14,9 @@ from zsched.core.values.fleet import Fleet, runs_worker
 from zsched.core.values.model import NodeId, TaskId, as_reason
 from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
-from zsched.core.values.words import told_of_worker
+from zsched.core.values.words import Trouble, told_of_worker
 
+NONE_RESTS: Mapping[TaskId, str] = {}
 TROUBLE_S = 60.0
 """Status shows a callback's error for this long after the last one."""
 
@@ -31,11 +32,11 @@ def given_away(profile: Profile) -> set[TaskId]:
 
 
 class Workers(Struct):
-    """{task: state} of every worker that this node keeps, and {task: why} of those that are not ready."""
+    """{task: state} of every worker that this node keeps, and {task: (trouble, why)} of those that are not ready."""
 
     states: dict[TaskId, WorkerState]
-    reasons: dict[TaskId, str] = field(default_factory=dict)
-    _troubles: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
+    reasons: dict[TaskId, tuple[Trouble, str]] = field(default_factory=dict)
+    _errors: dict[TaskId, tuple[str, float]] = field(default_factory=dict)
     """{task: (the newest error of a worker, when it came)}."""
     _mistakes: dict[TaskId, str] = field(default_factory=dict)
     """{task: a mistake of a ready worker that lasts as long as it lives}."""
@@ -79,7 +80,7 @@ class Workers(Struct):
         self._leaving.discard(task)
         self._unwatched.discard(task)
         del self.states[task]
-        for told in (self.reasons, self._troubles, self._mistakes, self._outdated):
+        for told in (self.reasons, self._errors, self._mistakes, self._outdated):
             told.pop(task, None)
 
     @classmethod
@@ -93,25 +94,25 @@ class Workers(Struct):
         if event.task not in self.states:
             return None
         if event.state is not WorkerState.READY:
-            self._troubles.pop(event.task, None)
+            self._errors.pop(event.task, None)
             self._mistakes.pop(event.task, None)
         if event.state is WorkerState.READY:
             self.reasons.pop(event.task, None)
         elif event.reason:
-            self.reasons[event.task] = as_reason(event.reason)
+            self.reasons[event.task] = (event.trouble, as_reason(event.reason))
         is_same, self.states[event.task] = self.states[event.task] is event.state, event.state
         if event.task in self._leaving and event.state is WorkerState.STOPPED:
             self._forget(event.task)
         if is_same:
             return None
-        text = f"worker {told_of_worker(event.state, event.reason).removeprefix('is ')}"
+        text = f"worker {told_of_worker(event.state, event.trouble, event.reason).removeprefix('is ')}"
         return RecordStory(stage="executor", text=text, task=event.task)
 
     def on_troubled(self, event: ev.WorkerTroubled, now: float) -> RecordStory | None:
         """A worker that is ready says that its callbacks raise, or that it makes a mistake; or one has begun cold."""
         if event.is_cold and event.task in self.states:
             text = as_reason(event.text)
-            self._troubles[event.task] = (text, now)
+            self._errors[event.task] = (text, now)
             return RecordStory(stage="executor", text=f"the worker {text}", task=event.task)
         if self.states.get(event.task) is not WorkerState.READY:
             return None
@@ -119,7 +120,7 @@ class Workers(Struct):
             self._mistakes[event.task] = as_reason(event.text)
         else:
             times = "once" if event.count == 1 else f"{event.count} times"
-            self._troubles[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
+            self._errors[event.task] = (as_reason(f"callback raised {times}: {event.text}"), now)
         return None
 
     def on_outdated(self, event: ev.WorkerOutdated) -> None:
@@ -129,15 +130,16 @@ class Workers(Struct):
         else:
             self._outdated.pop(event.task, None)
 
-    def told(self, now: float) -> Mapping[TaskId, str]:
-        """{task: why its worker is not ready, or what is wrong with a ready one}."""
-        if not self._troubles and not self._outdated and not self._mistakes:
+    def told(self, now: float, resting: Mapping[TaskId, str] = NONE_RESTS) -> Mapping[TaskId, tuple[Trouble, str]]:
+        """{task: why its worker is not ready, or what is wrong with a ready one}.
+
+        ``resting``: {task whose worker may not work: why}; what else is wrong with one is said instead.
+        """
+        if not resting and not self._errors and not self._outdated and not self._mistakes:
             return self.reasons
-        self._troubles = {task: one for task, one in self._troubles.items() if now - one[1] <= TROUBLE_S}
+        self._errors = {task: one for task, one in self._errors.items() if now - one[1] <= TROUBLE_S}
         outdated = {task: text for task, text in self._outdated.items() if self.states[task] is WorkerState.READY}
-        return {
-            **outdated,
-            **self._mistakes,
-            **{task: text for task, (text, _) in self._troubles.items()},
-            **self.reasons,
-        }
+        errors = {task: text for task, (text, _) in self._errors.items()}
+        told = {**resting, **outdated, **self._mistakes, **errors}
+        rests = {task: Trouble.RESTS if task in resting else Trouble.NONE for task in told}
+        return {**{task: (rests[task], text) for task, text in told.items()}, **self.reasons}

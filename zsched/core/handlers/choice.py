@@ -16,7 +16,7 @@ from zsched.core.profile.profile import BLIND_S
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.model import Proposal
-from zsched.core.values.profile import WorkerState
+from zsched.core.values.profile import WorkerState, with_troubles
 from zsched.core.values.struct import replace
 
 BLIND = f"nothing of this machine has been measured for {BLIND_S:g} s: a driver or a disk hangs; see the journal"
@@ -32,7 +32,7 @@ def publish_profile(node: Stages, todo: ToDo, now: float) -> None:
         is_draining=node.is_draining,
         now=now,
         progress=node.hangs.reports(now),
-        reasons={**node.resting(now), **node.workers.told(now)},
+        reasons=node.workers.told(now, node.resting(now)),
         echoes=node.round_trips.echoes(now),
         relay=node.relay_ends.told(now),
         renewals=node.renewing.told,
@@ -59,7 +59,7 @@ def _on_sampled(node: Stages, event: ev.ProfileSampled, _todo: ToDo, now: float)
 
 
 def _on_profile(node: Stages, event: ev.ProfileReceived, todo: ToDo, now: float) -> None:
-    profile = event.profile
+    profile = with_troubles(event.profile)
     if profile.node == node.me:
         return
     if node.agreement.strangers.is_one(profile.node, now):

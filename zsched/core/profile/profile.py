@@ -37,7 +37,7 @@ from zsched.core.values.profile import (
     WorkerState,
 )
 from zsched.core.values.struct import replace
-from zsched.core.values.words import Readings
+from zsched.core.values.words import Readings, Trouble
 
 RATIO_CHANGE = 0.02
 """This change of a CPU or memory ratio sends a profile at once."""
@@ -60,7 +60,8 @@ SIGNAL_SMOOTHING_S = 0.5
 """Least time constant of a signal: readings scatter by 2.5 to 2.9 dB."""
 RSSI_WINDOW = 5
 """A reading further than 25 dB from the median of the last 5 is dropped (measured on real drives)."""
-NO_REASONS: Mapping[TaskId, str] = {}
+NO_REASONS: Mapping[TaskId, tuple[Trouble, str]] = {}
+_WELL = (Trouble.NONE, "")
 NO_RENEWALS: Mapping[TaskId, Renewal] = {}
 
 
@@ -235,7 +236,7 @@ class Profiler:
         is_draining: bool,
         now: float,
         progress: tuple[TaskProgress, ...] = (),
-        reasons: Mapping[TaskId, str] = NO_REASONS,
+        reasons: Mapping[TaskId, tuple[Trouble, str]] = NO_REASONS,
         echoes: tuple[Echo, ...] = (),
         relay: str = "",
         renewals: Mapping[TaskId, Renewal] = NO_RENEWALS,
@@ -248,7 +249,7 @@ class Profiler:
             is_draining: the operator drains this node, or it stops.
             now: monotonic seconds.
             progress: which watched tasks answer this robot.
-            reasons: why workers are not ready.
+            reasons: what is wrong with workers, and why they are not ready.
             echoes: which profiles this node has of others; they are no reason to send one.
             relay: what is wrong with this node's relay.
             renewals: which workers run by an old recipe.
@@ -277,7 +278,7 @@ class Profiler:
     def _current(
         self,
         states: dict[TaskId, WorkerState],
-        reasons: Mapping[TaskId, str],
+        reasons: Mapping[TaskId, tuple[Trouble, str]],
         renewals: Mapping[TaskId, Renewal],
         *,
         is_draining: bool,
@@ -291,7 +292,8 @@ class Profiler:
             replace(
                 loads.get(task) or (self._told(task, state) if is_measured else WorkerLoad(task=task, state=state)),
                 state=state,
-                reason=reasons.get(task, ""),
+                trouble=reasons.get(task, _WELL)[0],
+                reason=reasons.get(task, _WELL)[1],
                 renewal=renewals.get(task, Renewal.NONE),
             )
             for task, state in sorted(states.items())
@@ -401,18 +403,11 @@ def _lost_or_won(new: WorkerLoad | None, old: WorkerLoad) -> bool:
 
 def _kinds(profile: Profile) -> tuple[object, ...]:
     """The parts of a profile that are no figures: every change of them counts."""
-    workers = [
-        # what a worker that is ready complains of is a count: it goes along with the figures
-        (load.task, load.state, bool(load.reason) if load.state is WorkerState.READY else load.reason, load.renewal)
-        for load in profile.workers
-    ]
-    return (
-        profile.draining,
-        workers,
-        profile.progress,
-        bool(profile.relay),
-        [(link.peer, link.source) for link in profile.links],
-    )
+    workers = [(load.task, load.state, load.trouble, load.renewal, bool(load.reason)) for load in profile.workers]
+    # what a worker that is ready complains of is a count: it goes along with the figures
+    reasons = [load.reason for load in profile.workers if load.state is not WorkerState.READY]
+    links = [(link.peer, link.source) for link in profile.links]
+    return profile.draining, workers, reasons, profile.progress, bool(profile.relay), links
 
 
 def _moved(new: float | None, old: float | None, threshold: float) -> bool:

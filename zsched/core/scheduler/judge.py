@@ -391,7 +391,7 @@ def escape_ahead(
     if profile is None or is_held or not _is_told(spec, profile):
         return ""
     load = profile.worker(spec.name)
-    how = "is not there" if load is None else told_of_worker(load.state, load.reason)
+    how = "is not there" if load is None else told_of_worker(load.state, load.trouble, load.reason)
     if not has_other:
         return f"the worker on {allocation.owner} {how}; nobody else can have the task"
     left_s = max(spec.worker.start_deadline_s - not_ready_for_s, 0.0)

@@ -6,7 +6,7 @@ Knows: what a beat tells, and in which range. Does not know: when to beat, what 
 from __future__ import annotations
 
 from zsched.core.values.electorate import check_id
-from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
+from zsched.core.values.model import NodeId, TaskId, check_counter, check_length, check_name
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
@@ -97,7 +97,6 @@ class Beat(Struct, frozen=True, kw_only=True):
         check_counter("beat.sequence", self.sequence)
         check_range("beat.loop_lag_s", self.loop_lag_s, 0.0, 86400.0)
         check_range("beat.save_s", self.save_s, 0.0, 86400.0)
-        if len(self.disk_refusal) > MAX_REASON:
-            raise ValueError(f"beat.disk_refusal: {len(self.disk_refusal)} characters, at most {MAX_REASON}")
+        check_length("beat.disk_refusal", self.disk_refusal)
         check_counter("beat.generation", self.generation)
         check_id("beat.disk", self.disk)

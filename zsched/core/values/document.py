@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from enum import StrEnum
 from typing import NewType
 
-from zsched.core.values.model import MAX_REASON, NodeId, TaskId, check_counter, check_name
+from zsched.core.values.model import NodeId, TaskId, check_counter, check_length, check_name
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import check_range
 
@@ -54,8 +54,7 @@ class Flag(Struct, frozen=True, kw_only=True):
         check_counter("flag.revision", self.revision)
         check_range("flag.for_s", self.for_s, 0.0, MAX_FLAG_S)
         for what in ("reason", "by"):
-            if len(getattr(self, what)) > MAX_REASON:
-                raise ValueError(f"flag.{what}: longer than {MAX_REASON} characters")
+            check_length(f"flag.{what}", getattr(self, what))
 
 
 class Rollout(Struct, frozen=True, kw_only=True):
@@ -80,8 +79,7 @@ class Rollout(Struct, frozen=True, kw_only=True):
         for node in self.first:
             check_name("rollout.first", node)
         for what in ("reason", "by"):
-            if len(getattr(self, what)) > MAX_REASON:
-                raise ValueError(f"rollout.{what}: longer than {MAX_REASON} characters")
+            check_length(f"rollout.{what}", getattr(self, what))
         words = (*self.command, *(word for pair in self.env for word in pair))
         if sum(len(word.encode("utf-8", "surrogatepass")) for word in words) > MAX_HELD_BYTES:
             raise ValueError(f"rollout.command: with its environment larger than {MAX_HELD_BYTES} bytes")

@@ -143,11 +143,8 @@ def possible(readings: Readings) -> Readings:
     (('battery', 0.5),)
     """
     found = dict(readings)
-    return tuple(
-        (gauge.name, found[gauge.name])
-        for gauge in GAUGES
-        if gauge.name in found and gauge.low <= found[gauge.name] <= gauge.high
-    )
+    known = ((gauge, found[gauge.name]) for gauge in GAUGES if gauge.name in found)
+    return tuple((gauge.name, reading) for gauge, reading in known if gauge.low <= reading <= gauge.high)
 
 
 def check_limits(limits: Readings) -> None:

@@ -40,6 +40,12 @@ def as_reason(text: str, longest: int = MAX_REASON) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
+def check_length(field: str, text: str, longest: int = MAX_REASON) -> None:
+    """Raise `ValueError` unless ``text`` has at most ``longest`` characters."""
+    if len(text) > longest:
+        raise ValueError(f"{field}: {len(text)} characters, at most {longest}")
+
+
 def check_name(field: str, value: str) -> None:
     """Raise `ValueError` unless ``value`` is a valid node, task or fleet name."""
     if NAME.fullmatch(value) is None:
@@ -196,8 +202,10 @@ class Asked(Struct, frozen=True, kw_only=True):
     reason: str = ""
 
     def __post_init__(self) -> None:
-        _check_text("asked.by", self.by, MAX_ASKER)
-        _check_text("asked.reason", self.reason, MAX_ASKED)
+        check_length("asked.by", self.by, MAX_ASKER)
+        check_length("asked.reason", self.reason, MAX_ASKED)
+        # half a character (a surrogate), which JSON may hold, goes into no frame: a `ValueError`, too
+        f"{self.by}{self.reason}".encode()
 
 
 def told_by(asked: Asked) -> str:
@@ -207,12 +215,6 @@ def told_by(asked: Asked) -> str:
     'ada@robot1 (new battery)'
     """
     return f"{asked.by} ({asked.reason})" if asked.reason else asked.by
-
-
-def _check_text(field: str, text: str, longest: int) -> None:
-    if len(text) > longest:
-        raise ValueError(f"{field}: {len(text)} characters, at most {longest}")
-    text.encode()  # half a character (a surrogate), which JSON may hold, goes into no frame: a `ValueError`, too
 
 
 class Pause(Struct, frozen=True, kw_only=True):

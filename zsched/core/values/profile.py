@@ -8,17 +8,17 @@ from __future__ import annotations
 from enum import StrEnum
 
 from zsched.core.values.model import (
-    MAX_REASON,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
     NodeId,
     TaskId,
     check_counter,
+    check_length,
     check_name,
     check_readings,
 )
-from zsched.core.values.struct import Struct
-from zsched.core.values.words import Readings, check_range
+from zsched.core.values.struct import Struct, replace
+from zsched.core.values.words import RESTS, Readings, Trouble, check_range
 
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
@@ -122,6 +122,7 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     memory_mb: float | None = None
     wanted_cores: float | None = None
     """Cores that it would use alone if some of its threads always want to run; ``None``: none does, or unknown."""
+    trouble: Trouble = Trouble.NONE
     reason: str = ""
     """Why it is not ready, or what is wrong with it though it is; at most `MAX_REASON` characters."""
     jobs: Jobs | None = None
@@ -136,8 +137,7 @@ class WorkerLoad(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_name("worker.task", self.task)
         check_range("worker.unended_s", self.unended_s, 0.0, MAX_JOB_S)
-        if len(self.reason) > MAX_REASON:
-            raise ValueError(f"worker.reason: {len(self.reason)} characters, at most {MAX_REASON}")
+        check_length("worker.reason", self.reason)
         check_range("worker.cpu_cores", self.cpu_cores, 0.0, MAX_CPU_CORES)
         check_range("worker.memory_mb", self.memory_mb, 0.0, MAX_MEMORY_MB)
         check_range("worker.wanted_cores", self.wanted_cores, 0.0, MAX_CPU_CORES)
@@ -248,8 +248,7 @@ class Profile(Struct, frozen=True, kw_only=True):
         check_range("profile.speed", self.speed, MIN_SPEED, MAX_SPEED)
         check_range("profile.cpu_pressure", self.cpu_pressure, 0.0, 1.0)
         check_range("profile.runnable", self.runnable, 0.0, MAX_RUNNABLE)
-        if len(self.relay) > MAX_REASON:
-            raise ValueError(f"profile.relay: {len(self.relay)} characters, at most {MAX_REASON}")
+        check_length("profile.relay", self.relay)
         check_readings("profile.gauges", self.gauges)
 
     def worker(self, task: TaskId) -> WorkerLoad | None:
@@ -268,3 +267,20 @@ class Profile(Struct, frozen=True, kw_only=True):
         """Cores that ``task``'s worker uses on this node; 0 without a worker or a measurement."""
         load = self.worker(task)
         return 0.0 if load is None else load.cpu_cores or 0.0
+
+
+# Goes with the next release: a daemon of the one before tells a worker's trouble by the first words of its reason.
+_OLD_WORDS = {"was ready until ": Trouble.LOST, "restarting": Trouble.AGAIN, RESTS: Trouble.RESTS}
+
+
+def with_troubles(profile: Profile) -> Profile:
+    """A peer's profile, in which an older daemon's words about its workers have become values."""
+    loads = tuple(map(_with_trouble, profile.workers))
+    return profile if loads == profile.workers else replace(profile, workers=loads)
+
+
+def _with_trouble(load: WorkerLoad) -> WorkerLoad:
+    told = (one for words, one in _OLD_WORDS.items() if load.reason.startswith(words))
+    trouble = load.trouble or next(told, Trouble.NONE)
+    is_old = trouble is not load.trouble and (load.state is WorkerState.READY) is (trouble is Trouble.RESTS)
+    return replace(load, trouble=trouble) if is_old else load

@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Final
 
 from zsched.core.values.document import Text
-from zsched.core.values.model import MAX_REASON, Asked, NodeId, TaskId, check_name
+from zsched.core.values.model import Asked, NodeId, TaskId, check_length, check_name
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
@@ -78,8 +78,7 @@ class KeepRehearsal(Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_name("rehearsal.task", self.task)
         check_name("rehearsal.name", self.name)
-        if len(self.told) > MAX_REASON:
-            raise ValueError(f"rehearsal.told: {len(self.told)} characters, at most {MAX_REASON}")
+        check_length("rehearsal.told", self.told)
         if len(self.body.encode()) > MAX_KEPT_BYTES:  # half a character is a `ValueError`, too: no file can hold it
             raise ValueError(f"rehearsal.body: larger than {MAX_KEPT_BYTES} bytes")
 

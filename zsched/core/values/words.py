@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from enum import StrEnum
 
 GaugeName = str
 """A gauge's name (`zsched.core.values.gauges`), of the alphabet of `NAME`."""
@@ -28,10 +29,6 @@ PAPER_METRICS = ("cpu", "memory", "network")
 _INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncounted"})
 """Reasons of drops by which nobody misses a sample: a rule wants them, or the sample came by another way."""
 
-WAS_READY = "was ready until "
-"""First words of the reason of a worker that was ready and no longer is; its supervisor calls that starting."""
-RESTARTING = "restarting"
-"""First words of the reason of a worker that has failed and is, or will be, started again."""
 CLOCK_IN_DOUBT = "clock in doubt"
 """Why a node may not have an exclusive task: its leases are worth nothing (`zsched.core.vote.clocks`)."""
 TOO_FEW_ELECTORS = "too few electors can give it a lease"
@@ -42,7 +39,15 @@ RESTS = "it rests, for it has no lease"
 """First words of what an exclusive task's owner says of its worker, which is ready."""
 COUNTED_ANEW = "since the relay's start or the stream's last change"
 """A stream keeps its count over both, so a message in it may have come before."""
-_READY = "ready"
+
+
+class Trouble(StrEnum):
+    """What is wrong with a worker, for decisions; its reason says it to people."""
+
+    NONE = ""
+    RESTS = "rests"  # it is ready, and may not work: it has no lease
+    LOST = "lost"  # it was ready and no longer is; its supervisor calls that starting
+    AGAIN = "again"  # it has failed and is, or will be, started again
 
 
 def shown(number: int) -> int:
@@ -60,8 +65,7 @@ def meant(number: int | None, now: int) -> int:
     >>> meant(3, 4294967300), meant(4294967298, 4294967300), meant(None, 7)
     (4294967299, 4294967298, 7)
     """
-    if number is None:
-        return now
+    number = now if number is None else number
     return number if number >= CREATION_STEP else now - shown(now) + number
 
 
@@ -71,21 +75,18 @@ def told_of_silence(electors: int) -> str:
     return alone if electors == 1 else "no majority of the electors answered"
 
 
-def told_of_worker(state: str, reason: str) -> str:
+def told_of_worker(state: str, trouble: str, reason: str) -> str:
     """The state of a worker (`zsched.core.values.profile.WorkerState`) in words, to follow its name."""
-    if state != _READY and reason.startswith(WAS_READY):
-        return reason
-    if state != _READY and reason.startswith(RESTARTING):
-        return f"is {reason}"
-    return f"is {state}{': ' if reason else ''}{reason}"
+    how = reason if trouble == Trouble.AGAIN else f"{state}{': ' if reason else ''}{reason}"
+    return reason if trouble == Trouble.LOST else f"is {how}"
 
 
-def has_lost_its_worker(state: str, reason: str) -> bool:
+def has_lost_its_worker(state: str, trouble: str) -> bool:
     """Whether an owner with such a worker does no work, and will not soon: it failed, stopped, or was ready and is not.
 
     ``state`` is a `zsched.core.values.profile.WorkerState`. One that starts for the first time is not among them.
     """
-    return state in ("failed", "stopped") or (state == "starting" and reason.startswith(WAS_READY))
+    return state in ("failed", "stopped") or (state == "starting" and trouble == Trouble.LOST)
 
 
 def check_range(field: str, value: float | None, low: float, high: float) -> None:

@@ -20,6 +20,7 @@ from zsched.core.profile.profile import (
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import RSSI_MAX_DBM, RSSI_MIN_DBM
 from zsched.core.values.profile import DeviceSample, Link, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState
+from zsched.core.values.words import Trouble
 
 TIMING = Timing()
 READY = {"merge": WorkerState.READY}
@@ -356,10 +357,15 @@ def test_sent_at_once_when_a_worker_changes_or_the_node_drains() -> None:
     failed = {"merge": WorkerState.FAILED}
     assert profiler.publishable(failed, is_draining=False, now=0.1) is not None
     assert profiler.publishable(failed, is_draining=False, now=0.2) is None
-    told = profiler.publishable(failed, is_draining=False, now=0.25, reasons={"merge": "no such map"})
+    told = profiler.publishable(failed, is_draining=False, now=0.25, reasons={"merge": (Trouble.NONE, "no such map")})
     assert told is not None
     assert [one.reason for one in told.workers] == ["no such map"]
-    draining = profiler.publishable(failed, is_draining=True, now=0.3, reasons={"merge": "no such map"})
+    same = {"merge": (Trouble.AGAIN, "no such map")}
+    again = profiler.publishable(failed, is_draining=False, now=0.27, reasons=same)
+    assert again is not None
+    assert [(one.trouble, one.reason) for one in again.workers] == [(Trouble.AGAIN, "no such map")]
+    assert profiler.publishable(failed, is_draining=False, now=0.28, reasons=same) is None
+    draining = profiler.publishable(failed, is_draining=True, now=0.3, reasons=same)
     assert draining is not None
     assert draining.draining
 
@@ -369,10 +375,16 @@ def test_what_a_ready_worker_complains_of_goes_along_with_the_figures() -> None:
     profiler = make_profiler()
     profiler.absorb(device(), (), now=0.0)
     taken(profiler, 0.0)
-    first = profiler.publishable(READY, is_draining=False, now=0.1, reasons={"merge": "callback raised once"})
+    raised = {"merge": (Trouble.NONE, "callback raised once")}
+    first = profiler.publishable(READY, is_draining=False, now=0.1, reasons=raised)
     assert first is not None
     assert [one.reason for one in first.workers] == ["callback raised once"]
-    assert profiler.publishable(READY, is_draining=False, now=0.2, reasons={"merge": "raised 200 times"}) is None
+    more = {"merge": (Trouble.NONE, "raised 200 times")}
+    assert profiler.publishable(READY, is_draining=False, now=0.2, reasons=more) is None
+    rests = {"merge": (Trouble.RESTS, "raised 200 times")}
+    assert profiler.publishable(READY, is_draining=False, now=0.3, reasons=rests) is not None, (
+        "it may not work any more"
+    )
 
 
 def test_sent_at_once_when_a_link_falls_silent_or_is_taken_away() -> None:
