@@ -18,6 +18,8 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole
 from zsched.core.values.profile import WorkerState
+from zsched.core.values.struct import replace
+from zsched.core.values.words import Trouble
 from zsched_lab.sim.checks import Invariants
 from zsched_lab.sim.parts import Machine
 
@@ -219,8 +221,10 @@ class Work:
         """A worker exits: started again by its supervisor, or (``is_final``) given up."""
         if machine.node is None or task not in machine.workers:
             return
-        state = WorkerState.FAILED if is_final else WorkerState.STARTING
-        self._sim.deliver(machine, ev.WorkerChanged(task=task, state=state, reason="exit code 1"))
+        told = ev.WorkerChanged(task=task, state=WorkerState.FAILED, reason="exit code 1")
+        if not is_final:
+            told = replace(told, state=WorkerState.STARTING, trouble=Trouble.AGAIN, reason="restarting: exit code 1")
+        self._sim.deliver(machine, told)
         if not is_final:
             self._sim.later(WORKER_START_S, self._ready, machine, task, machine.life)
 

@@ -18,6 +18,7 @@ from support.schemas import faults
 from zsched.cli import app
 from zsched.commands.common import SCHEMAS, known_majors, schema_of
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.profile import Jobs, WorkerLoad
 from zsched.core.values.snapshot import DecisionStatus, NodeStatus, QuorumStatus, Snapshot, TaskStatus, VoteStatus
 
 RECORDED = Path(__file__).parent / "recorded_status"
@@ -86,7 +87,8 @@ def test_every_field_of_a_status_is_in_the_schema() -> None:
     schema = json.loads((SCHEMAS / "zsched.status.1.json").read_text())
     told = {name: set(part["properties"]) for name, part in schema["$defs"].items() if "properties" in part}
     told["Snapshot"] = set(schema["properties"]) - {"degraded"}
-    for cls in (Snapshot, NodeStatus, TaskStatus, DecisionStatus, VoteStatus, QuorumStatus, StreamCount):
+    parts = (NodeStatus, TaskStatus, DecisionStatus, VoteStatus, QuorumStatus, StreamCount, WorkerLoad, Jobs)
+    for cls in (Snapshot, *parts):
         assert told[cls.__name__] == {field.name for field in fields(cls)}
 
 
