@@ -169,7 +169,7 @@ def test_eq3_a_candidate_that_no_majority_reaches_cannot_be_offloaded_to() -> No
     }
 
     assert pick(joint(rows).aggregates, None) == "edge2"
-    assert joint(rows).vetoed["edge1"] == "reached by 1 of 3 robots"
+    assert str(joint(rows).vetoed["edge1"]) == "reached by 1 of 3 robots"
     assert SPEC.reach is Reach.MAJORITY
 
 

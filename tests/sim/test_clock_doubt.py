@@ -162,7 +162,7 @@ def test_beats_say_so_and_the_others_take_it_for_other_terms() -> None:
     other = Leases(fleet=fleet("edge1", "edge2"), me="robot1", incarnation=1, standing={}, now=0.0)
     mine.doubt({})
     other.on_beat(beat("edge1", 5, terms=mine.terms_told), {}, 10.0)
-    assert "clock in doubt" in other.unfit()["edge1"]
+    assert "clock in doubt" in other.unfit()["edge1"].why
     mine.trust({}, 5, 12.0)
     other.on_beat(beat("edge1", 6, terms=mine.terms_told), {}, 12.0)
     assert other.unfit() == {}
@@ -274,12 +274,12 @@ def test_the_only_candidate_works_again_once_its_clock_is_right() -> None:
 
 
 def test_a_majority_of_electors_in_doubt_keeps_nobody_at_work() -> None:
-    sim, owner = started("edge1", "edge2")
+    sim, _ = started("edge1", "edge2")
     for name in ROBOTS[:2]:
         slewed(sim, name, 6.0)
     sim.run(1.5)
     assert working(sim) == ""
-    assert sim.run_until(lambda: working(sim) == owner, 15.0)
+    assert sim.run_until(lambda: working(sim) != "", 15.0)
 
 
 def test_one_elector_in_doubt_is_not_missed() -> None:

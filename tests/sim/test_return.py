@@ -31,7 +31,7 @@ def settled_on_edge1() -> Simulator:
 def vetoes(sim: Simulator) -> list[str]:
     """Why each robot does not give edge1 the task."""
     standings = [sim.node(robot).rounds.tasks["merge"].standing for robot in ROBOTS]
-    return [standing.vetoed.get("edge1", "") for standing in standings if standing is not None]
+    return [str(standing.vetoed.get("edge1", "")) for standing in standings if standing is not None]
 
 
 def test_a_node_whose_cut_has_healed_waits_until_a_dead_link_s_lease_would_have_ended() -> None:

@@ -20,6 +20,7 @@ from zsched.commands.history import age_s_of, is_known, is_move, wall_text, when
 from zsched.commands.page import Cell, Page, memory, name_room, short_name, span
 from zsched.commands.weight_words import shares
 from zsched.core.values.struct import Struct, replace
+from zsched.core.values.veto import Filter
 from zsched.core.values.words import PAPER_METRICS, meant, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
@@ -265,6 +266,7 @@ def render(body: Json, width: int, color: bool) -> str:
     _made(page, body)
     _tuning(page, body)
     _robots(page, body)
+    _filters(page, body)
     if body["at"] is None:
         _vote(page, body)
     page.lines.append("")
@@ -401,6 +403,17 @@ def formula_of(body: Json) -> str:
 def _robots(page: Page, body: Json) -> None:
     silent = [(f"silent: {', '.join(body['silent'])}", "yellow")] if body["silent"] else []
     page.block("ROBOTS", (f"{len(body['heard'])} heard, {body['needed']} needed", ""), *silent)
+
+
+def _filters(page: Page, body: Json) -> None:
+    """Which filters keep candidates out, in the order in which they are looked at."""
+    kept_out: dict[str, list[str]] = {}
+    for one in body["candidates"]:
+        if name := one.get("filter"):  # a later field of the schema's major version
+            kept_out.setdefault(name, []).append(one["node"])
+    left = len(body["candidates"]) - sum(map(len, kept_out.values()))
+    parts: list[Cell] = [(f"{one} keeps out {', '.join(kept_out[one])}", "yellow") for one in Filter if one in kept_out]
+    page.block("FILTERS", (f"{left} of {len(body['candidates'])} candidates pass", ""), *parts)
 
 
 def _vote(page: Page, body: Json) -> None:

@@ -58,9 +58,6 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
             yield f"a machine that it leaves less than {of_cpu} of the CPU free {less} (cpu_floor_ratio)"
         elif tuning.weights.cpu > 0.0:
             yield "what programs that are no tasks would still get there does not count (cpu_floor_ratio: 0)"
-    else:
-        less = "and a machine that would have less gets nothing while another one has more"
-        yield f"an owner with less than {floor} of its memory free is left at once, {less} (memory_floor_ratio)"
     for name, limit in spec.gauge_limits:
         gauge = BY_NAME[name]
         side, unknown = ("below" if gauge.is_floor else "above"), ("refused" if gauge.is_needed else "taken")
@@ -120,9 +117,8 @@ def _links(spec: TaskSpec) -> Iterator[str]:
     """What a signal is worth; of nodes on cables it says nothing."""
     limits = spec.limits
     yield f"a robot does not reach a candidate whose signal is below {limits.nu_dbm:g} dBm (link.nu_dbm)"
-    if spec.tuning.score is ScoreForm.SERVICE:
-        least = f"{limits.nu_dbm + REACH_MARGIN_DB:g} dBm"
-        yield f"while the owner is reached, another one's own signal counts from {least} on, so it moves a task once"
+    least = f"{limits.nu_dbm + REACH_MARGIN_DB:g} dBm"
+    yield f"while the owner is reached, another one's own signal counts from {least} on, so it moves a task once"
     if spec.tuning.weights.network > 0.0:
         yield f"a signal is worth 0 at {limits.nu_dbm:g} dBm and 1 from {limits.rho_dbm:g} dBm on (link.rho_dbm)"
         yield f"through one access point {_PAIR[limits.pair]} counts (link.pair: {limits.pair})"

@@ -41,11 +41,10 @@ from zsched.core.profile.relay_ends import RelayEnds
 from zsched.core.recent import RecentWorst
 from zsched.core.route.gaps import StreamGaps
 from zsched.core.route.rates import StreamRates
+from zsched.core.scheduler.eligibility import NO_DOUBTS, Doubts
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.probation import Probation
-from zsched.core.scheduler.rested import Rested
 from zsched.core.scheduler.rounds import Rounds
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts
 from zsched.core.scheduler.unseen import Unseen
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag
@@ -56,10 +55,12 @@ from zsched.core.values.plan import StreamCount, WorkerRole
 from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import CLOCK_IN_DOUBT, RESTS
+from zsched.core.values.veto import Veto
+from zsched.core.values.words import RESTS
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.disks import Disks
 from zsched.core.vote.expiry import Expiry
+from zsched.core.vote.lease import IN_DOUBT
 from zsched.core.vote.retuning import Retuning
 from zsched.core.vote.voting import Votes
 
@@ -172,7 +173,7 @@ class Stages:
         self.round_trips = RoundTrips(me)
         # SCHEDULER, VOTE
         self.votes = Votes(fleet, me)
-        self.probation, self.unseen, self.rested = Probation(fleet), Unseen(), Rested()
+        self.probation, self.unseen = Probation(fleet), Unseen()
         self.flags = NodeFlags(rank=[node.name for node in fleet.nodes].index(me))
         self.rounds = Rounds(
             fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips, self.flags
@@ -321,20 +322,10 @@ class Stages:
                 if profile is not None:
                     yield name, profile
 
-    def unfit(self, task: TaskId, now: float) -> Mapping[NodeId, str]:
+    def unfit(self, task: TaskId, now: float) -> Mapping[NodeId, Veto]:
         """{node: why it can hold no lease} of an exclusive task; of any other one nobody needs any."""
         if not self.executors[task].is_leased:
             return {}
-        return self._with_rested(self.fleet.task(task), self._leaseless(task, now), now)
-
-    def _with_rested(self, spec: TaskSpec, leaseless: Mapping[NodeId, str], now: float) -> Mapping[NodeId, str]:
-        """{node: why it can hold no lease}, by beats and by what owners have said."""
-        there = {self.me, self.registers[spec.name].value.owner, *(name for name, _ in self._heard(spec, now))}
-        others = [name for name in spec.candidates if name in there and name not in leaseless]
-        return {**leaseless, **self.rested.reasons(spec.name, others, now)}
-
-    def _leaseless(self, task: TaskId, now: float) -> Mapping[NodeId, str]:
-        """{node: why it can hold no lease, by beats}."""
         owner, confirm_s, misses = self.registers[task].value.owner, self.fleet.timing.confirm_s, self.membership.misses
 
         def are_apart(node: NodeId, elector: NodeId) -> bool:
@@ -351,20 +342,16 @@ class Stages:
             return found
         for task in self.owned():
             if self.tenure.misses_lease(self.registers[task].value, now):
-                why = self.unfit(task, now).get(self.me, "no majority of the electors grants one")
-                why = CLOCK_IN_DOUBT if leases.is_in_doubt else why
+                veto = IN_DOUBT if leases.is_in_doubt else self.unfit(task, now).get(self.me)
+                why = "no majority of the electors grants one" if veto is None else veto.why
                 found[task] = f"{RESTS} ({why})"
         return found
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:
         in_grace, unproven = self.membership.in_grace(), self.probation.doubts(spec, now)
-        value, needs_lease = self.registers[spec.name].value, self.executors[spec.name].is_leased
-        owner = value.owner
-        leaseless = self._leaseless(spec.name, now) if needs_lease or value.leased else {}
+        owner = self.registers[spec.name].value.owner
+        unfit = self.unfit(spec.name, now)
         told = None if owner is None else self.gateway.fresh(owner, now)
-        if told is not None and value.leased:
-            self.rested.hear(spec.name, told, now, is_explained=owner in leaseless)
-        unfit = self._with_rested(spec, leaseless, now) if needs_lease else {}
         loads = ((name, profile.worker(spec.name)) for name, profile in self._heard(spec, now))
         ready = (name for name, load in loads if load is not None and load.state is WorkerState.READY)
         left = frozenset(self.flags.drained)

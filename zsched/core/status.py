@@ -14,7 +14,7 @@ from zsched.core.executor.rollouts import waiting
 from zsched.core.gateway.company import is_full
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.route.rates import STALE_S
-from zsched.core.scheduler.eligibility import is_of_machine, may_get
+from zsched.core.scheduler.eligibility import OF_MACHINE, may_get
 from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import score
@@ -43,6 +43,7 @@ from zsched.core.values.snapshot import (
     VoteStatus,
 )
 from zsched.core.values.struct import replace
+from zsched.core.values.veto import Filter
 from zsched.core.values.words import Trouble, shown, told_of_worker
 from zsched.core.vote.generations import way_out
 from zsched.core.vote.voting import Voting
@@ -621,19 +622,20 @@ def _no_spare(node: Stages, task: TaskSpec, value: Allocation, owner: NodeId, no
     """
     is_missed, untold = False, list[str]()
     states = {**node.membership.states(), owner: PeerState.GONE}
-    refused = dict(score(task.under(value.tuning), value, node.me, node.gateway, states, now).refused)
+    vetoes = score(task.under(value.tuning), value, node.me, node.gateway, states, now).vetoes
     for profile in _heard(node, now):
         if not _may_follow(node, task, profile, owner):
             continue
         load = profile.worker(task.name)
         is_told = load is not None and (load.state is WorkerState.FAILED or _is_in_the_way(task, load))
         is_ready = not is_told and may_get(task, None if load is None else load.state)
-        lack = refused.get(profile.node, "")
-        if is_ready and not is_of_machine(lack):
+        lack = vetoes.get(profile.node)
+        if is_ready and (lack is None or lack.filter not in OF_MACHINE):
             return
         is_missed = True
         if is_ready:
-            untold.append(f"{profile.node} {lack}" if lack.startswith("needs") else f"on {profile.node} {lack}")
+            is_memory = lack is not None and lack.filter is Filter.MEMORY
+            untold.append(f"{'' if is_memory else 'on '}{profile.node} {lack}")
         elif load is None:
             untold.append(f"{profile.node} runs no worker for it")
         elif not is_told:  # why the others cannot stands in lines of their own
@@ -715,7 +717,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
         age_s=now - standing.judged_at,
         aggregates=tuple(sorted(judgement.aggregates.items())),
         utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
-        vetoed=tuple(sorted(joint.vetoed.items())),
+        vetoed=tuple((name, veto.why) for name, veto in sorted(joint.vetoed.items())),
         unkept=tuple(sorted(standing.judge.kept.unkept(joint.aggregates, standing.judge.spec.memory_s, now).items())),
         silent=standing.silent,
     )

@@ -1,6 +1,7 @@
 """``python -m zsched_lab.decisions.ablation OFF service ...``: the study with mechanisms of forecasting switched off.
 
-``OFF`` is one name of `SWITCHES` or several with commas between; what follows is as for `zsched_lab.decisions`.
+``OFF`` is one name of `SWITCHES` or of a filter that one robot looks at by itself (`zsched.core.values.veto.Filter`),
+or several with commas between; what follows is as for `zsched_lab.decisions`.
 
 Knows: which function or figure each mechanism hangs on. Does not know: what it earns.
 """
@@ -15,7 +16,9 @@ from zsched.core.gateway import demand
 from zsched.core.gateway.job_need import JobNeed
 from zsched.core.gateway.sharing import Shares
 from zsched.core.scheduler import utility
+from zsched.core.scheduler.eligibility import CHAIN
 from zsched.core.scheduler.kept import Kept
+from zsched.core.values.veto import Filter
 from zsched_lab.decisions.__main__ import main
 
 Switch = tuple[Any, str, Any]
@@ -54,6 +57,8 @@ SWITCHES: Final[Mapping[str, tuple[Switch, ...]]] = {
 
 if __name__ == "__main__":
     for name in filter(None, sys.argv.pop(1).split(",")):
-        for place, attribute, value in SWITCHES[name]:
+        for place, attribute, value in SWITCHES.get(name, ()):
             setattr(place, attribute, value)
+        if name not in SWITCHES:
+            del CHAIN[Filter(name)]
     main()

@@ -3,7 +3,7 @@
 ``python -m zsched_lab.sim.missed_electors --down 1.6 5``.
 
 Knows: the fleet, which links are down when, what is counted. Does not know: who is left for whom
-(`zsched.core.vote.lease`, `zsched.core.scheduler.rested`).
+(`zsched.core.vote.lease`, `zsched.core.scheduler.eligibility`).
 """
 
 from __future__ import annotations

@@ -89,7 +89,6 @@ def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
     node.clear_problems(Problem.FLEET, Problem.OWN_FILE)
     node.gateway.adopt(fleet)
     node.probation.adopt(fleet)
-    node.rested.keep(tasks, names)
     node.unseen.adopt(tasks, names)
 
 

@@ -14,12 +14,14 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.scheduler.scoring import UNMEASURED, Doubts, score
+from zsched.core.scheduler.eligibility import Doubts
+from zsched.core.scheduler.scoring import score
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, SetHold
 from zsched.core.values.messages import CommandOutcome, CommandResult, Hold, HoldTask, MoveTask, TuneTask
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, TaskId, told_by
+from zsched.core.values.veto import Filter
 from zsched.core.values.words import shown
 
 Refusal = tuple[CommandOutcome, str]
@@ -82,9 +84,9 @@ def unfit(node: Stages, value: Allocation, target: NodeId, now: float) -> str:
     left = frozenset() if value.owner is None else frozenset({value.owner})
     doubts = Doubts(left=left, unfit=node.unfit(value.task, now))
     vector = score(spec, value, node.me, node.gateway, node.membership.states(), now, doubts=doubts)
-    refused = dict(vector.refused)
-    if target in refused and (node.rounds.is_voter or refused[target] != UNMEASURED.format("network")):
-        return refused[target]
+    veto = vector.vetoes.get(target)
+    if veto is not None and (node.rounds.is_voter or veto.filter is not Filter.LINK):
+        return veto.why
     reach = {utility.candidate: utility.reachable for utility in vector.utilities}
     is_far = node.rounds.is_voter and not reach.get(target, True)
     return f"{node.me} does not reach it" if is_far else ""

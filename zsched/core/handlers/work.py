@@ -20,7 +20,8 @@ from zsched.core.values.plan import StreamCount
 from zsched.core.values.problems import Problem
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
-from zsched.core.values.words import CREATION_STEP, HAS_RESTED, TOO_FEW_ELECTORS, shown
+from zsched.core.values.veto import Filter
+from zsched.core.values.words import CREATION_STEP, shown
 
 Why = str | None
 """Why a value came about; ``None``: another node committed it."""
@@ -175,19 +176,20 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     """
     if left is None or left == node.me:
         return False
-    votes = _votes(node, value)
+    votes, standing = _votes(node, value), node.rounds.tasks[value.task].standing
     is_escape, has_met = any(one.is_escape for one in votes), any(one.voter != node.me for one in votes)
-    if not is_ours and not (is_escape and has_met):
+    veto = None if standing is None else standing.vetoed.get(left)
+    lacks_lease = veto is not None and veto.filter in (Filter.LEASE, Filter.RESTS)
+    if not is_ours and not ((is_escape or lacks_lease) and has_met):
         return False
     state = node.membership.state(left)
     if state is PeerState.GONE or (state is PeerState.SUSPECT and is_escape):
         return True
-    profile = node.gateway.fresh(left, now)
     if is_escape and node.hangs.progress.overdue_s(value.task, node.executors[value.task].epoch, now) is not None:
         return True
-    if is_escape and node.unfit(value.task, now).get(left, "").startswith((TOO_FEW_ELECTORS, HAS_RESTED)):
-        return True  # or it comes back with each of its links' good moments
-    return profile is not None and profile.has_failed(value.task)
+    profile = node.gateway.fresh(left, now)
+    # without a lease, it would come back with each of its links' good moments
+    return lacks_lease or (profile is not None and profile.has_failed(value.task))
 
 
 def _told(weights: Weights) -> str:

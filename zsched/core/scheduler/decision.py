@@ -12,13 +12,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from zsched.core.scheduler.fuse import Fuse
-from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason, short_of_memory
+from zsched.core.scheduler.judge import Judge, Judgement, Outcome, escape_ahead, escape_reason
 from zsched.core.scheduler.standing import Standing, compare, reaches_owner
 from zsched.core.values.decision import Figures, Rules, Verdict
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
-from zsched.core.values.model import Allocation, NodeId, PeerState, ScoreForm
+from zsched.core.values.model import Allocation, NodeId, PeerState
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
+from zsched.core.values.veto import Filter, Veto
 
 
 class Decided(Struct, frozen=True, kw_only=True):
@@ -26,14 +27,14 @@ class Decided(Struct, frozen=True, kw_only=True):
 
     standing: Standing
     judgement: Judgement
-    escape: str | None
+    escape: Veto | None
     """Why the owner is to be left at once."""
     leaving: str | None
     """Why the owner is to be left, by an escape or by an operator's drain."""
     needed: int
     """How many robots' utilities this decision needs."""
     takes_turns: bool = False
-    """It waits for other tasks' moves: a planned one, or a flight from short memory."""
+    """It waits for other tasks' moves, as a planned one does."""
     is_waiting_its_turn: bool = False
     """Another task's move holds it back."""
 
@@ -52,27 +53,16 @@ def decide_by(compared: Standing, judge: Judge, fuse: Fuse, figures: Figures) ->
     standing = _keep_out(compared, figures)
     escape = _escape(judge, standing, figures)
     standing = _leave_to_others(standing, figures)
-    out = set(figures.out)
-    is_short = escape is not None and escape == short_of_memory(judge.spec, allocation, figures.owner_profile)
-    if allocation.tuning.score is ScoreForm.PAPER:
-        roomy = _with_room(standing, figures)
-        has_other = bool(roomy.aggregates.keys() - {allocation.owner})
-        may_stay = escape is None and not figures.drained and allocation.owner in roomy.aggregates
-        if is_short and not has_other:
-            escape, is_short = None, False  # where all are short of memory, to flee would only be to come back
-        elif is_short or (not allocation.is_bound and (has_other or may_stay)):
-            out |= standing.aggregates.keys() - roomy.aggregates.keys()
-            standing = roomy
     needed = _robots_needed(figures, is_escape=escape is not None)
     if standing.voters_heard < needed:
         reason = f"utilities of {standing.voters_heard} robots, {needed} needed"
         judgement = Judgement(outcome=Outcome.NONE, candidate=None, aggregate=0.0, reason=reason)
     else:
-        judge.out = frozenset(out)
+        judge.out = frozenset(figures.out)
         judgement = judge.judge(
             standing,
             allocation,
-            escape=escape,
+            escape=None if escape is None else escape.why,
             drained=figures.drained,
             is_called=figures.is_called,
             now=figures.now,
@@ -81,8 +71,7 @@ def decide_by(compared: Standing, judge: Judge, fuse: Fuse, figures: Figures) ->
         )
     if escape is None:
         judgement = _look_ahead(judge, judgement, standing, figures)
-    # two tasks that flee from one machine for its memory would both find room on another, and both flee from there
-    takes_turns = judgement.outcome is Outcome.PROPOSE and (not judgement.is_escape or is_short)
+    takes_turns = judgement.outcome is Outcome.PROPOSE and not judgement.is_escape
     is_waiting = takes_turns and figures.first is not None
     if is_waiting:
         # the figures are read again before it is judged once more
@@ -93,7 +82,7 @@ def decide_by(compared: Standing, judge: Judge, fuse: Fuse, figures: Figures) ->
         standing=standing,
         judgement=judgement,
         escape=escape,
-        leaving=escape or (f"{allocation.owner} is {figures.drained}" if figures.drained else None),
+        leaving=escape.why if escape else f"{allocation.owner} is {figures.drained}" if figures.drained else None,
         needed=needed,
         takes_turns=takes_turns,
         is_waiting_its_turn=is_waiting,
@@ -153,7 +142,8 @@ def verdict_of(judgement: Judgement) -> Verdict:
 def _keep_out(standing: Standing, figures: Figures) -> Standing:
     """The standing without the candidates that take nothing new; an owner among them keeps what it has."""
     candidates = figures.rules.candidates
-    return _without(standing, {name: why for name, why in figures.closed if name in candidates}, figures)
+    closed = {name: Veto(Filter.ORDER, why) for name, why in figures.closed if name in candidates}
+    return _without(standing, closed, figures)
 
 
 def _leave_to_others(standing: Standing, figures: Figures) -> Standing:
@@ -164,22 +154,11 @@ def _leave_to_others(standing: Standing, figures: Figures) -> Standing:
     """
     if figures.allocation.is_bound:
         return standing
-    rest = _without(standing, dict(figures.claimed), figures)
+    rest = _without(standing, {name: Veto(Filter.ROOM, why) for name, why in figures.claimed}, figures)
     return rest if rest.aggregates.keys() - {figures.allocation.owner} else standing
 
 
-def _with_room(standing: Standing, figures: Figures) -> Standing:
-    """The standing without the candidates that would be left at once for want of memory, by the paper's score."""
-    short = {
-        one.candidate: f"would have {one.memory * 100:.0f} % of its memory free"
-        for vector in standing.vectors
-        for one in vector.utilities
-        if one.memory is not None and one.memory < figures.rules.memory_floor_ratio
-    }
-    return _without(standing, {**short, **standing.vetoed}, figures)
-
-
-def _without(standing: Standing, shut: Mapping[NodeId, str], figures: Figures) -> Standing:
+def _without(standing: Standing, shut: Mapping[NodeId, Veto], figures: Figures) -> Standing:
     """The standing without the candidates of ``shut`` ({candidate: why}) but the owner."""
     shut = {name: why for name, why in shut.items() if name != figures.allocation.owner}
     if not shut:
@@ -197,7 +176,7 @@ def _robots_needed(figures: Figures, *, is_escape: bool) -> int:
     return max(min(needed, majority(len(figures.present))), 1) if is_escape else needed
 
 
-def _escape(judge: Judge, standing: Standing, figures: Figures) -> str | None:
+def _escape(judge: Judge, standing: Standing, figures: Figures) -> Veto | None:
     allocation, profile = figures.allocation, figures.owner_profile
     if allocation.owner is None:
         return None

@@ -1,22 +1,23 @@
-"""SCHEDULER: whether a node may have a task, by its own profile, and why not.
+"""SCHEDULER: whether a node may have a task, and which filter keeps it out.
 
-Knows: workers' states, memory that is not there, gauges' limits. Does not know: what the node is worth
-(`zsched.core.scheduler.scoring`), who reaches it, doubts.
+Knows: the chain of filters: leases, workers' states, memory that is not there, gauges' limits. Does not know: what the
+node is worth (`zsched.core.scheduler.scoring`), who reaches it, what others say (`zsched.core.scheduler.standing`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
+from typing import Final
 
 from zsched.core.scheduler.usage import Use
 from zsched.core.values.fleet import Standby, TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
-from zsched.core.values.model import Allocation, PeerState
+from zsched.core.values.model import NodeId, PeerState
 from zsched.core.values.profile import Profile, Renewal, WorkerState
+from zsched.core.values.struct import Struct, field
+from zsched.core.values.veto import Filter, Veto
 from zsched.core.values.words import GaugeName
-
-_NEEDS = "needs "
-_BACK = ", back from "
 
 
 def is_out(spec: TaskSpec, profile: Profile) -> bool:
@@ -59,36 +60,103 @@ def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
     return state is WorkerState.READY or (starts_then and state is not WorkerState.FAILED)
 
 
-def refusal(
-    spec: TaskSpec,
-    allocation: Allocation,
-    profile: Profile,
-    needed_mb: float,
-    use: Use,
-    gauges: Mapping[GaugeName, float],
-    *,
-    is_kept: bool = True,
-) -> str:
-    """Why the node may not have the task; empty when it may.
+class Doubts(Struct, frozen=True, kw_only=True):
+    """Doubts about nodes that are too young, or not enough, to take a task from them."""
 
-    ``needed_mb``: memory without which the task is not placed, as it is part of ``use``. ``is_kept``: the owner keeps
-    the task, or may have it back (`may_return`).
-    """
-    if profile.draining:
-        return "draining"
-    load = profile.worker(spec.name)
+    in_grace: AbstractSet[NodeId] = frozenset()
+    """Suspect, but not for long enough to tell a lost beat from a lost node: an owner among them counts as alive."""
+    unproven: Mapping[NodeId, str] = field(default_factory=dict)
+    """{candidate: why it may not get the task} of those that were gone (`zsched.core.scheduler.probation`)."""
+    unseen: AbstractSet[NodeId] = frozenset()
+    """Not reached by this robot's streams, though by its questions (`zsched.core.scheduler.unseen`)."""
+    left: AbstractSet[NodeId] = frozenset()
+    """They are to hand over the task (an operator's order, a worker that is not ready in time): an owner among them
+    does not get it back."""
+    unfit: Mapping[NodeId, Veto] = field(default_factory=dict)
+    """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
+
+
+NO_DOUBTS = Doubts()
+
+
+class Case(Struct, frozen=True, kw_only=True):
+    """One candidate as one robot sees it."""
+
+    spec: TaskSpec
+    node: NodeId
+    is_owner: bool
+    state: PeerState
+    doubts: Doubts = NO_DOUBTS
+    profile: Profile | None = None
+    """Its newest fresh one."""
+    needed_mb: float = 0.0
+    """Memory without which the task is not placed there."""
+    use: Use = Use(cpu_cores=None, memory_mb=None)
+    """What will be in use there, ``needed_mb`` included."""
+    gauges: Mapping[GaugeName, float] = field(default_factory=dict)
+    """What its gauges will read."""
+    is_kept: bool = True
+    """The owner keeps the task, or may have it back (`may_return`)."""
+
+
+def _heard(case: Case) -> str:
+    return "not heard yet" if case.state is PeerState.UNKNOWN else ""  # we may have just started
+
+
+def _lease(case: Case, which: Filter = Filter.LEASE) -> str:
+    veto = case.doubts.unfit.get(case.node)
+    return veto.why if veto is not None and veto.filter is which else ""
+
+
+def _rests(case: Case) -> str:
+    """Beats tell who hears whom, but of an elector that this node does not hear nothing: its owner knows better."""
+    is_resting = case.is_owner and case.profile is not None and case.profile.rests(case.spec.name)
+    return "it says that it has no lease" if is_resting else ""
+
+
+def _streams(case: Case) -> str:
+    return "" if case.is_owner else case.doubts.unproven.get(case.node, "")
+
+
+def _worker(case: Case) -> str:
+    """Why its worker cannot do the task."""
+    load = None if case.profile is None else case.profile.worker(case.spec.name)
     state = None if load is None else load.state
-    if spec.worker.command and state is None:
+    if case.spec.worker.command and state is None:
         return "runs no worker for it"
     why = "" if load is None or not load.reason else f": {load.reason}"
     if state is WorkerState.FAILED:
         return f"worker failed{why}"
-    is_owner = profile.node == allocation.owner
-    if not is_owner and not may_get(spec, state):
-        return f"worker {state}{why}"
-    return lacks_memory(profile, needed_mb, use) or _beyond_limits(
-        spec, profile, gauges, is_owner=is_owner, is_kept=is_kept
-    )
+    return "" if case.is_owner or may_get(case.spec, state) else f"worker {state}{why}"
+
+
+def _memory(case: Case) -> str:
+    return "" if case.profile is None else lacks_memory(case.profile, case.needed_mb, case.use)
+
+
+CHAIN: dict[Filter, Callable[[Case], str]] = {
+    Filter.HEARD: _heard,
+    Filter.LEASE: _lease,
+    Filter.TERMS: lambda case: _lease(case, Filter.TERMS),
+    Filter.RESTS: _rests,
+    Filter.STREAMS: _streams,
+    Filter.PROFILE: lambda case: "" if case.profile is not None else "no fresh profile",
+    Filter.DRAIN: lambda case: "draining" if case.profile is not None and case.profile.draining else "",
+    Filter.WORKER: _worker,
+    Filter.MEMORY: _memory,
+    Filter.LIMIT: lambda case: _beyond_limits(case, has_margin=False),
+    # a task that nobody keeps goes to a machine inside the margin, too: it could move back to no other one
+    Filter.MARGIN: lambda case: _beyond_limits(case, has_margin=True) if case.is_kept and not case.is_owner else "",
+}
+"""What one robot looks at by itself, in order: {filter: why it keeps the candidate out, or nothing}."""
+
+
+def veto(case: Case) -> Veto | None:
+    """Why the node may not have the task; ``None``: it may, as far as one robot sees."""
+    for name, check in CHAIN.items():
+        if why := check(case):
+            return Veto(name, why)
+    return None
 
 
 def lacks_memory(profile: Profile, needed_mb: float, use: Use) -> str:
@@ -96,16 +164,13 @@ def lacks_memory(profile: Profile, needed_mb: float, use: Use) -> str:
     used = use.memory_mb
     if used is None or used <= profile.memory_mb:
         return ""
-    return f"{_NEEDS}{needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
+    return f"needs {needed_mb:.0f} MiB, has {max(profile.memory_mb - used + needed_mb, 0.0):.0f} free"
 
 
-def is_for_comers(reason: str) -> bool:
-    """Whether a refusal may be by what counts only while the task has an owner: learnt memory, a gauge's margin.
-
-    >>> [is_for_comers(why) for why in ("needs 6144 MiB, has 5120 free", "worker starting")]
-    [True, False]
-    """
-    return reason.startswith(_NEEDS) or _BACK in reason
+FOR_COMERS: Final = frozenset({Filter.MEMORY, Filter.MARGIN})
+"""They may go by what counts only while the task has an owner: learnt memory, a gauge's margin."""
+OF_MACHINE: Final = frozenset({Filter.MEMORY, Filter.LIMIT, Filter.MARGIN})
+"""What a machine lacks: memory, or a gauge within its limit."""
 
 
 def is_far_beyond(spec: TaskSpec, gauges: Mapping[GaugeName, float]) -> bool:
@@ -124,31 +189,18 @@ def _owner_limits(spec: TaskSpec) -> dict[GaugeName, float]:
     return limits
 
 
-def is_of_machine(reason: str) -> bool:
-    """Whether a refusal says what the machine lacks: memory, or a gauge within its limit.
-
-    >>> [is_of_machine(why) for why in ("battery is at 18 %, limit 20 %", "no fresh profile")]
-    [True, False]
-    """
-    return reason.startswith((_NEEDS, *(f"{name} " for name in BY_NAME)))
-
-
-def _beyond_limits(
-    spec: TaskSpec, profile: Profile, gauges: Mapping[GaugeName, float], *, is_owner: bool, is_kept: bool
-) -> str:
-    """Why the machine's gauges forbid the task; empty: they do not.
-
-    A task that nobody keeps goes to a machine inside the margin, too: there is no other one that it could move back to.
-    """
-    told = dict(possible(profile.gauges)) if spec.gauge_limits else {}
-    added = {"gpu"} if spec.demand.gpu and not is_owner else set[str]()
-    limits = _owner_limits(spec) if is_owner else dict(spec.gauge_limits)
+def _beyond_limits(case: Case, *, has_margin: bool) -> str:
+    """Why the machine's gauges forbid the task; empty: they do not."""
+    if not case.spec.gauge_limits or case.profile is None:
+        return ""
+    spec, told = case.spec, dict(possible(case.profile.gauges))
+    limits = _owner_limits(spec) if case.is_owner else dict(spec.gauge_limits)
     faults = (
         BY_NAME[name].fault(
-            gauges.get(name),
+            case.gauges.get(name),
             limit,
-            has_margin=is_kept and not is_owner,
-            is_reckoned=name in added,
+            has_margin=has_margin,
+            is_reckoned=name == "gpu" and bool(spec.demand.gpu) and not case.is_owner,
             is_old=name not in told,
         )
         for name, limit in limits.items()

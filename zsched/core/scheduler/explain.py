@@ -3,32 +3,24 @@
 Knows: how the terms become a total, and the order in which a judgement is held back. Does not know: how that is shown
 (`zsched.commands.explain`), live state: it goes by written figures alone.
 
-The sums are not taken from the verdict. They are made again from the robots' terms, so that a reader can check them.
+The sums are not taken from the verdict. They are made again, so that a reader can check them.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
-from zsched.core.scheduler.eligibility import is_for_comers
+from zsched.core.scheduler.eligibility import FOR_COMERS
 from zsched.core.scheduler.fuse import WINDOW_S, Fuse
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.kept import Kept
-from zsched.core.scheduler.standing import RESOLUTION, Standing, counted, mean_of, pick, rounded
-from zsched.core.scheduler.utility import total_utility
+from zsched.core.scheduler.standing import Standing, pick, rounded
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import NodeId, PeerState, Tuning, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
-
-_TIE = RESOLUTION / 2
-"""So far above the owner's rounded total another one counts as higher."""
-_SHOWN = 10_000
-"""A worth is shown to four digits: one that is needed is rounded up, so that it is enough."""
-_HALVINGS = 40
 
 
 class RobotView(Struct, frozen=True, kw_only=True):
@@ -44,6 +36,8 @@ class RobotView(Struct, frozen=True, kw_only=True):
     reachable: bool = True
     refused: str = ""
     """Why this robot did not score it; empty: it did."""
+    filter: str = ""
+    """Which filter kept it out (`zsched.core.values.veto.Filter`)."""
 
 
 class CandidateSum(Struct, frozen=True, kw_only=True):
@@ -61,6 +55,8 @@ class CandidateSum(Struct, frozen=True, kw_only=True):
     """Seconds of work that the task owes there, with what it will lose; ``None``: it cannot have it."""
     why_not: str = ""
     """Why it cannot have the task, or must be left."""
+    filter: str = ""
+    """Which filter keeps it out."""
     need_cpu_cores: float | None = None
     need_memory_mb: float | None = None
     robots: tuple[RobotView, ...] = ()
@@ -187,29 +183,18 @@ def _cut_off(vector: UtilityVector, node: NodeId, figures: Figures) -> UtilityVe
         return vector
     others = [one for one in vector.utilities if one.candidate != node]
     lost = Utility(candidate=node, value=0.0, reachable=False)
-    kept = [pair for pair in vector.refused if pair[0] != node]
+    kept = {name: veto for name, veto in vector.vetoes.items() if name != node}
     if node == figures.allocation.owner:  # what only keeps others from a task that somebody has
-        kept = [(name, f"{why}, which may not matter then" if is_for_comers(why) else why) for name, why in kept]
-    return replace(vector, utilities=tuple(sorted((*others, lost), key=lambda one: one.candidate)), refused=tuple(kept))
+        kept |= {
+            name: replace(veto, why=f"{veto.why}, which may not matter then")
+            for name, veto in kept.items()
+            if veto.filter in FOR_COMERS
+        }
+    utilities = tuple(sorted((*others, lost), key=lambda one: one.candidate))
+    return replace(vector, utilities=utilities).refusing(kept)
 
 
 # --- the sums --------------------------------------------------------------------------------------------------------
-
-
-def utility_of(utility: Utility, tuning: Tuning) -> float | None:
-    """A robot's utility made again from its terms; 0 for a candidate that it does not reach."""
-    if not utility.reachable:
-        return 0.0
-    measured = frozenset(name for name, term in utility.terms.items() if term is not None)
-    return total_utility(
-        tuning.weights,
-        cpu=utility.cpu,
-        memory=utility.memory,
-        network=utility.network,
-        measured=measured,
-        form=tuning.score,
-        gauges=dict(utility.gauges),
-    )
 
 
 def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
@@ -225,6 +210,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
         joint = standing.aggregates.get(name)
         bonus = tuning.bonus if name == owner and not is_left else 0.0
         need = needs.get(name)
+        veto = again.escape if is_left else standing.vetoed.get(name)
         is_out = joint is None or is_left
         found.append(
             CandidateSum(
@@ -235,7 +221,8 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
                 bonus=bonus,
                 total=None if is_out or joint is None else joint - unkept.get(name, 0.0) + bonus,
                 owed_s=again.judgement.owed.get(name),
-                why_not=again.leaving or "" if is_left else standing.vetoed.get(name, ""),
+                why_not=again.leaving or "" if is_left else "" if veto is None else veto.why,
+                filter="" if veto is None else veto.filter,
                 need_cpu_cores=None if need is None else need.cpu_cores,
                 need_memory_mb=None if need is None else need.memory_mb,
                 robots=tuple(_views(name, standing)),
@@ -248,9 +235,9 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
 
 def _views(name: NodeId, standing: Standing) -> Iterator[RobotView]:
     for vector in standing.vectors:
-        why = dict(vector.refused).get(name)
-        if why is not None:
-            yield RobotView(robot=vector.voter, refused=why)
+        veto = vector.vetoes.get(name)
+        if veto is not None:
+            yield RobotView(robot=vector.voter, refused=veto.why, filter=veto.filter)
         for one in vector.utilities:
             if one.candidate == name:
                 yield RobotView(
@@ -301,21 +288,10 @@ def _changes(figures: Figures, verdict: Verdict, again: Decided, sums: tuple[Can
 def _leads(figures: Figures, again: Decided, owner: CandidateSum, others: list[CandidateSum]) -> Iterator[str]:
     """What the owner's challengers lack: worth, or time."""
     assert owner.total is not None
-    needed = rounded(owner.total) + _TIE
     for number, one in enumerate(others):
         assert one.total is not None
-        assert one.joint is not None
         if rounded(one.total) <= rounded(owner.total):
-            worth = math.ceil((needed + one.unkept) * _SHOWN) / _SHOWN
-            lack, way = worth - one.joint, "or the"
-            if worth <= 1.0:
-                yield f"{one.node} would have to be worth {worth:.4f} instead of {one.joint:.4f} ({lack:+.4f})"
-            else:
-                way, most = "the", f"{owner.node} has {owner.total:.4f} with its bonus"
-                yield f"{one.node} cannot lead while {most}: no worth is enough"
-            level = None if number else owner_cpu_below(figures, again.standing, owner, one.total)
-            if level is not None:
-                yield f"{way} cpu term of {owner.node} would have to fall below {level:.4f} at every robot"
+            yield f"{one.node} lacks {owner.total - one.total:.4f} of worth to be ahead of {owner.node}"
         elif not number:
             yield from _times(figures, again, one.node, owner.node)
 
@@ -333,32 +309,3 @@ def _times(figures: Figures, again: Decided, node: NodeId, owner: NodeId) -> Ite
         yield f"until {majority(electors)} of {electors} electors are heard ({heard} are)"
     if Fuse.of(figures.fuse).moves_within(WINDOW_S, figures.now, escapes=False) >= figures.rules.max_moves_per_minute:
         yield f"until fewer than {figures.rules.max_moves_per_minute} moves lie in the last minute"
-
-
-def owner_cpu_below(figures: Figures, standing: Standing, owner: CandidateSum, rival_total: float) -> float | None:
-    """The level of the owner's cpu term, alike at every robot, below which a rival has the higher total.
-
-    ``None``: at no level, or no robot measured that term.
-    """
-    tuning = figures.allocation.tuning
-    vectors = counted(standing.aggregates, standing.vectors)
-    column = [one for vector in vectors for one in vector.utilities if one.candidate == owner.node]
-    terms = [one.cpu for one in column if one.cpu is not None]
-    if tuning.weights.cpu <= 0.0 or not terms:
-        return None
-
-    def is_beaten(level: float) -> bool:
-        values = []
-        for one in column:
-            lower = one if one.cpu is None else replace(one, cpu=min(one.cpu, level))
-            values.append(utility_of(lower, tuning) or 0.0)
-        mean = mean_of(tuning.aggregate)
-        return rounded(rival_total) > rounded(mean(values) + owner.bonus)
-
-    low, high = 0.0, max(terms)
-    if not is_beaten(low):
-        return None
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if is_beaten(middle) else (low, middle)
-    return low

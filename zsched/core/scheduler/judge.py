@@ -22,17 +22,16 @@ from zsched.core.scheduler.ledger import Ledger
 from zsched.core.scheduler.standing import LOST_S, Standing, pick
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, ScoreForm, told_by
+from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, told_by
 from zsched.core.values.profile import Profile, Renewal, WorkerState
-from zsched.core.values.struct import Struct, field
-from zsched.core.values.words import CLOCK_IN_DOUBT, HAS_RESTED, TOO_FEW_ELECTORS, told_of_worker
+from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.veto import Filter, Veto
+from zsched.core.values.words import told_of_worker
 
 FIT_S: Final = 2.0
 """A task goes home to the node that it is pinned to once that could have had it for so long."""
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
-_LEASELESS: Final = (CLOCK_IN_DOUBT, TOO_FEW_ELECTORS, HAS_RESTED)
-"""First words of vetoes by which an owner's exclusive worker cannot be at work for long."""
 FORGIVEN_RATIO: Final = 0.1
 """An owner's worker that is ready makes up so much of the time in which it was not."""
 
@@ -321,10 +320,8 @@ def escape_reason(
     standing: Standing,
     not_ready_for_s: float,
     held_s: float = 0.0,
-) -> str | None:
+) -> Veto | None:
     """Why the owner must be left now, whatever a move costs (but never without the quorum).
-
-    Short memory is such a reason under the paper's score, which does not tell it from enough; `ScoreForm.SERVICE` does.
 
     Args:
         spec: the task.
@@ -338,41 +335,30 @@ def escape_reason(
     owner = allocation.owner
     if owner is None:
         return None
-    if owner_state is PeerState.GONE:
-        return f"{owner} is gone"
-    if owner_state is PeerState.SUSPECT:
-        return f"{owner} is silent"
+    if owner_state in (PeerState.GONE, PeerState.SUSPECT):
+        return Veto(Filter.HEARD, f"{owner} is {'gone' if owner_state is PeerState.GONE else 'silent'}")
     if owner not in spec.candidates:
-        return f"{owner} is no candidate any more"
+        return Veto(Filter.ORDER, f"{owner} is no candidate any more")
     if profile is not None:
         load = profile.worker(spec.name)
         if profile.draining:
-            return f"{owner} is draining"
+            return Veto(Filter.DRAIN, f"{owner} is draining")
         why = "" if load is None or not load.reason else f": {load.reason}"
         if load is not None and load.state is WorkerState.FAILED:
-            return f"the worker on {owner} failed{why}"
+            return Veto(Filter.WORKER, f"the worker on {owner} failed{why}")
         if load is not None and load.renewal is Renewal.LEAVES:
-            return f"{owner} gives it away: its worker starts again, by the changed fleet file"
+            return Veto(Filter.WORKER, f"{owner} gives it away: its worker starts again, by the changed fleet file")
         start_s = spec.worker.start_deadline_s
         if _is_told(spec, profile) and not_ready_for_s > start_s:
             often = f", and {start_s + held_s:.0f} s of the time before" if held_s else ""
-            return f"the worker on {owner} has not been ready for {not_ready_for_s - held_s:.1f} s{often}{why}"
+            late = f"the worker on {owner} has not been ready for {not_ready_for_s - held_s:.1f} s{often}{why}"
+            return Veto(Filter.WORKER, late)
     veto = standing.vetoed.get(owner)
-    if veto is not None and veto.startswith("reached by"):
-        return f"{owner} is {veto}"
-    if veto is not None and veto.startswith(_LEASELESS):  # its exclusive worker has stopped, or is about to
-        return f"{owner}: {veto}"
-    return short_of_memory(spec, allocation, profile)
-
-
-def short_of_memory(spec: TaskSpec, allocation: Allocation, profile: Profile | None) -> str | None:
-    """That the owner leaves less memory free than the task's floor, where the score is the paper's; the last escape."""
-    if profile is None or profile.memory_used_mb is None or allocation.tuning.score is not ScoreForm.PAPER:
-        return None
-    free_ratio = 1.0 - profile.memory_used_mb / profile.memory_mb
-    if free_ratio >= spec.memory_floor_ratio:
-        return None
-    return f"memory of {allocation.owner} is {max(free_ratio, 0.0) * 100:.0f} % free"
+    if veto is not None and veto.filter is Filter.REACH:
+        return replace(veto, why=f"{owner} is {veto}")
+    if veto is not None and veto.filter is Filter.LEASE:  # its exclusive worker has stopped, or is about to
+        return replace(veto, why=f"{owner}: {veto}")
+    return None
 
 
 def _is_told(spec: TaskSpec, profile: Profile) -> bool:

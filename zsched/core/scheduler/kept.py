@@ -58,7 +58,7 @@ class Kept(Struct):
         """Note what each machine is worth now, and what ``owner`` gives.
 
         While the task's use still rises the newest figure counts, then the best one: a load that comes is not the
-        machine's doing.
+        machine's doing. Until then what the machine gave before stays: one that fails so soon has not mended.
 
         >>> kept = Kept()
         >>> kept.look({"edge1": 0.6, "edge2": 0.9}, "edge1", now=0.0)
@@ -68,13 +68,13 @@ class Kept(Struct):
         """
         if owner != self.owner:
             self.owner, self.since = owner, now
-            if owner is not None:
-                self.seen.pop(owner, None)
         if owner is not None and owner in worth and owner in self.foretold:
-            gave, before = worth[owner], self.seen.get(owner)
-            if before is not None and now - self.since >= SETTLE_S:
+            gave, has_settled, before = worth[owner], now - self.since >= SETTLE_S, self.seen.get(owner)
+            is_of_now = before is not None and before[2] >= self.since
+            if before is not None and is_of_now and has_settled:
                 gave = max(gave, before[1])
-            self.seen[owner] = (self.foretold[owner], gave, now)
+            if before is None or is_of_now or has_settled:
+                self.seen[owner] = (self.foretold[owner], gave, now)
         self.foretold |= {name: value for name, value in worth.items() if name != owner or name not in self.foretold}
 
     def fail(self, node: NodeId, now: float) -> None:

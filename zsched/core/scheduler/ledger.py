@@ -48,7 +48,7 @@ class Ledger(Struct):
 
         Args:
             losses: {machine: what of a second of its work the task loses there}, at most 1; 1: it cannot have it.
-            owner: where the task is.
+            owner: where the task is. While it is nowhere nothing is charged: who starts late would owe for that.
             price_s: what a move costs, in seconds of the task's work.
             memory_s: half of what is owed is forgotten in this time.
             now: monotonic seconds.
@@ -58,7 +58,7 @@ class Ledger(Struct):
         >>> {name: round(one, 6) for name, one in ledger.owed.items()}
         {'edge1': 0.25, 'edge2': 0.0}
         """
-        gap_s = 0.0 if self.at is None else min(max(now - self.at, 0.0), LONGEST_GAP_S)
+        gap_s = 0.0 if self.at is None or owner is None else min(max(now - self.at, 0.0), LONGEST_GAP_S)
         self.at = now
         kept = 0.5 ** (gap_s / memory_s)
         owed = {name: self.owed.get(name, 0.0) * kept + loss * gap_s for name, loss in losses.items()}

@@ -23,12 +23,12 @@ from zsched.core.gateway.round_trips import RoundTrips
 from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.claims import claims_of_others, taken
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
-from zsched.core.scheduler.eligibility import has_living_owner, is_out
+from zsched.core.scheduler.eligibility import NO_DOUBTS, Doubts, has_living_owner, is_out
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.rest import Answers, is_like
-from zsched.core.scheduler.scoring import NO_DOUBTS, Doubts, score
+from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import Standing
 from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
 from zsched.core.scheduler.usage import book

@@ -8,12 +8,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
 
 from zsched.core.gateway.demand import Demands, speed_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
-from zsched.core.scheduler.eligibility import has_living_owner, is_far_beyond, may_return, refusal
+from zsched.core.scheduler.eligibility import (
+    NO_DOUBTS,
+    Case,
+    Doubts,
+    has_living_owner,
+    is_far_beyond,
+    may_return,
+    veto,
+)
 from zsched.core.scheduler.links import PairLink, pair_link, ways
 from zsched.core.scheduler.usage import Bookings, Use, coming_use, own_use, predicted, predicted_gauges
 from zsched.core.scheduler.utility import (
@@ -38,7 +45,8 @@ from zsched.core.values.model import (
     UtilityVector,
 )
 from zsched.core.values.profile import Profile
-from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.struct import Struct, replace
+from zsched.core.values.veto import Filter, Veto
 from zsched.core.values.words import GaugeName
 
 REACH_MARGIN_DB = 3.0
@@ -51,10 +59,6 @@ _NAMES = {
     for flags in itertools.product((False, True), repeat=3)
 }
 """{which of Eq. 1-3 are measured: their names}."""
-
-
-UNMEASURED = "{}: not measured there, and it has a weight"
-"""Why a candidate has no worth beside others that have one. Of links that only says what this node measures."""
 
 
 class _Terms(Struct, frozen=True):
@@ -72,27 +76,6 @@ class _Terms(Struct, frozen=True):
         return three.union(self.gauges) if self.gauges else three
 
 
-class Doubts(Struct, frozen=True, kw_only=True):
-    """Doubts about nodes that are too young, or not enough, to take a task from them."""
-
-    in_grace: AbstractSet[NodeId] = frozenset()
-    """Suspect, but not for long enough to tell a lost beat from a lost node: an owner among them counts as alive."""
-    unproven: Mapping[NodeId, str] = field(default_factory=dict)
-    """{candidate: why it may not get the task} of those that were gone (`zsched.core.scheduler.probation`)."""
-    unseen: AbstractSet[NodeId] = frozenset()
-    """Not reached by this robot's streams, though by its questions (`zsched.core.scheduler.unseen`)."""
-    left: AbstractSet[NodeId] = frozenset()
-    """They are to hand over the task (an operator's order, a worker that is not ready in time): an owner among them
-    does not get it back."""
-    unfit: Mapping[NodeId, str] = field(default_factory=dict)
-    """{candidate: why it may not have the task, though it has it} of an exclusive task (`zsched.core.vote.lease`)."""
-
-    def against(self, candidate: NodeId, owner: NodeId | None) -> str:
-        """Why a candidate that is alive may not have the task; empty: nothing is against it."""
-        return self.unfit.get(candidate) or (self.unproven.get(candidate, "") if candidate != owner else "")
-
-
-NO_DOUBTS = Doubts()
 NOTHING_HELD: Mapping[NodeId, float] = {}
 
 
@@ -133,26 +116,27 @@ def score(
         away_s = ways(voter, spec.candidates, round_trips, gateway, now)
     terms: dict[NodeId, _Terms] = {}
     unreachable: list[NodeId] = []
-    refused: list[tuple[NodeId, str]] = []
+    vetoes: dict[NodeId, Veto] = {}
     for candidate in spec.candidates:
         found = view.terms(candidate, away_s.get(candidate, 0.0))
         if found is None:
             unreachable.append(candidate)
-        elif isinstance(found, str):
-            refused.append((candidate, found))
+        elif isinstance(found, Veto):
+            vetoes[candidate] = found
         else:
             terms[candidate] = found
     _spare_gpu(spec, allocation, terms)
     _spare_own_link(voter, terms)
     utilities, unmeasured = _weighed(allocation.tuning, terms)
     utilities += [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
-    return UtilityVector(
+    vector = UtilityVector(
         voter=voter,
         task=spec.name,
         revision=allocation.revision,
         utilities=tuple(sorted(utilities, key=lambda utility: utility.candidate)),
-        refused=tuple(sorted((*refused, *unmeasured))),
     )
+    vetoes |= unmeasured
+    return vector.refusing(vetoes) if vetoes else vector
 
 
 class _View:
@@ -184,7 +168,7 @@ class _View:
         is_within = told is None or not is_far_beyond(spec, gateway.readings(told))
         of_owner = pair_link(voter, owner, gateway, spec.limits, now) if has_owner and owner is not None else None
         margin_db = own_margin_db = 0.0
-        if is_kept and allocation.tuning.score is ScoreForm.SERVICE:
+        if is_kept:
             margin_db = REACH_MARGIN_DB
             # the way to the access point takes no part in who is better where the owner is reached by it, too
             own_margin_db = margin_db if of_owner is None or of_owner.is_direct else 0.0
@@ -193,12 +177,17 @@ class _View:
         self._is_kept = is_kept and is_within
         self._of_owner, self._margin_db, self._own_margin_db = of_owner, margin_db, own_margin_db
 
-    def terms(self, candidate: NodeId, network_s: float) -> _Terms | str | None:
-        """Eq. 1-3 for a candidate to which ``network_s`` lead and back; why it is refused; ``None``: not reached."""
-        found = self._profile(candidate)
-        if not isinstance(found, Profile):
-            return found
-        spec, allocation, gateway, now, profile = self._spec, self._allocation, self._gateway, self._now, found
+    def terms(self, candidate: NodeId, network_s: float) -> _Terms | Veto | None:
+        """Eq. 1-3 for a candidate to which ``network_s`` lead and back; why it is kept out; ``None``: not reached."""
+        spec, allocation, gateway, now, doubts = self._spec, self._allocation, self._gateway, self._now, self._doubts
+        state, is_owner = self._states.get(candidate, PeerState.UNKNOWN), candidate == allocation.owner
+        is_there = state is PeerState.ALIVE or (is_owner and candidate in doubts.in_grace)
+        if state is not PeerState.UNKNOWN and (not is_there or candidate in doubts.unseen):
+            return None
+        case = Case(spec=spec, node=candidate, is_owner=is_owner, state=state, doubts=doubts)
+        profile = gateway.fresh(candidate, now)
+        if profile is None:
+            return veto(case)
         demand, is_comer = gateway.demand(spec, profile), self._owner is not None and candidate != self._owner
         own = own_use(spec, allocation, profile, demand, gateway)
         coming = coming_use(spec, profile, self._bookings, gateway, now, None if is_comer else own)
@@ -206,35 +195,36 @@ class _View:
         gauges = predicted_gauges(spec, allocation, profile, self._bookings, gateway, now)
         needed = demand if is_comer else spec.demand
         least_use = use if needed is demand else predicted(profile, own, needed, coming)
-        if reason := refusal(spec, allocation, profile, needed.memory_mb, least_use, gauges, is_kept=self._is_kept):
-            return reason
+        case = replace(
+            case, profile=profile, needed_mb=needed.memory_mb, use=least_use, gauges=gauges, is_kept=self._is_kept
+        )
+        if (found := veto(case)) is not None:
+            return found
         link = self._link(candidate)
         if link is not None and not link.is_reached:
             return None
         fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
         load = profile.worker(spec.name)
         # what an owner that is short gets is measured
-        is_measured = candidate == allocation.owner and load is not None and is_short(load)
-        least = min(fair, own.cpu_cores) if is_measured else fair
-        seen_s = gateway.demands.seen_s(spec.name, profile, now) if candidate == allocation.owner else 0.0
-        cpu = _cpu(spec, profile, demand, use, allocation.tuning, gateway.demands, network_s, seen_s, least, fair)
-        if is_measured and cpu is not None and allocation.tuning.score is ScoreForm.SERVICE:
-            cpu = min(cpu, gateway.demands.given_ratio(spec.name, profile, now))
-        memory = _memory(spec, profile, demand, use, allocation.tuning.score)
+        is_measured = is_owner and load is not None and is_short(load)
+        worth = _Worth(
+            spec=spec,
+            profile=profile,
+            demand=demand,
+            use=use,
+            least_cores=min(fair, own.cpu_cores) if is_measured else fair,
+            fair_cores=fair,
+            network_s=network_s,
+            is_owner=is_owner,
+            is_short=is_measured,
+            demands=gateway.demands,
+            now=now,
+        )
+        tuning = allocation.tuning
+        is_paper = tuning.score is ScoreForm.PAPER
+        cpu, memory = worth.by_paper() if is_paper else worth.by_service(tuning.deadline_ms)
         weighed, at_limit = _gauges(allocation, gauges), link is not None and link.at_limit
         return _Terms(cpu, memory, None if link is None else link.utility, weighed, at_limit)
-
-    def _profile(self, candidate: NodeId) -> Profile | str | None:
-        """The newest profile of a candidate that is there; why it is refused; ``None``: not reached."""
-        state, doubts = self._states.get(candidate, PeerState.UNKNOWN), self._doubts
-        if state is PeerState.UNKNOWN:
-            return "not heard yet"  # we may have just started: that says nothing about it
-        is_spared = candidate == self._allocation.owner and candidate in doubts.in_grace
-        if (state is not PeerState.ALIVE and not is_spared) or candidate in doubts.unseen:
-            return None
-        if doubt := doubts.against(candidate, self._allocation.owner):
-            return doubt
-        return self._gateway.fresh(candidate, self._now) or "no fresh profile"
 
     def _link(self, candidate: NodeId) -> PairLink | None:
         if candidate == self._owner:
@@ -243,14 +233,14 @@ class _View:
         return pair_link(self._voter, candidate, self._gateway, self._spec.limits, self._now, *margins)
 
 
-def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utility], list[tuple[NodeId, str]]]:
-    """What each candidate is worth by its terms, and why some have no worth."""
+def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utility], dict[NodeId, Veto]]:
+    """What each candidate is worth by its terms, and why some have no worth beside others that have one."""
     named = {name: term.names() for name, term in terms.items()}
     measured = frozenset[str]().union(*named.values())
     weighed = [name for name, weight in tuning.weights.shares if weight > 0.0]
     # a machine that does not tell its CPU or memory is blind; of links and gauges there may be none
     are_alike = not {"cpu", "memory", *measured} & {*weighed}
-    utilities, refused = [], []
+    utilities, vetoes = [], dict[NodeId, Veto]()
     for candidate, term in terms.items():
         by_gauge = term.gauges
         if lacking := measured - named[candidate]:
@@ -268,8 +258,9 @@ def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utili
         if are_alike:
             value = 1.0
         elif value is None:
-            unknown = ", ".join(name for name in weighed if name not in named[candidate] and name not in by_gauge)
-            refused.append((candidate, UNMEASURED.format(unknown)))
+            unknown = [name for name in weighed if name not in named[candidate] and name not in by_gauge]
+            kept_out = Filter.LINK if unknown == ["network"] else Filter.FIGURES
+            vetoes[candidate] = Veto(kept_out, f"{', '.join(unknown)}: not measured there, and it has a weight")
             continue
         utilities.append(
             Utility(
@@ -282,7 +273,7 @@ def _weighed(tuning: Tuning, terms: Mapping[NodeId, _Terms]) -> tuple[list[Utili
                 at_limit=term.at_limit,
             )
         )
-    return utilities, refused
+    return utilities, vetoes
 
 
 def _spare_own_link(voter: NodeId, terms: dict[NodeId, _Terms]) -> None:
@@ -319,47 +310,54 @@ def _is_assumed(name: str) -> bool:
     return not BY_NAME[name].is_needed
 
 
-def _cpu(
-    spec: TaskSpec,
-    profile: Profile,
-    demand: Demand,
-    use: Use,
-    tuning: Tuning,
-    demands: Demands,
-    network_s: float,
-    seen_s: float,
-    least_cores: float,
-    fair_cores: float,
-) -> float | None:
-    """Eq. 1, or the share of its jobs that the task would get done, in time where it has a deadline.
+class _Worth(Struct, frozen=True):
+    """What Eq. 1 and 2 go by on one candidate that has the task, or what `ScoreForm.SERVICE` has in their place."""
 
-    ``seen_s``: its jobs are seen to take this there. ``least_cores``: it gets at least this if it needs it, however
-    full the machine is. ``fair_cores``: a job gets at least this while it runs. Between its jobs a task uses nothing,
-    so that may be far more than it needs on the mean.
-    """
-    used = use.cpu_cores
-    if used is None:
-        return None
-    if tuning.score is ScoreForm.PAPER:
-        return cpu_utility(profile.cpu_cores, used)
-    free, job = profile.cpu_cores - used + demand.cpu_cores, demands.job(spec.name)
-    share = spare_factor(profile.cpu_cores - used, profile.cpu_cores, spec.cpu_floor_ratio)
-    if job is None:
-        return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, share=share)
-    speed = speed_of(profile)
-    if tuning.deadline_ms is not None:
-        job_s = max(job.age_s(speed, max(free, fair_cores)), seen_s) + network_s
-        share *= timely_worth(on_time(job_s, tuning.deadline_ms / 1e3))
-    most = job.most_cores(speed, demand.cpu_cores)
-    return service_utility(free, demand.cpu_cores, profile.cpu_cores, least=least_cores, most=most, share=share)
+    spec: TaskSpec
+    profile: Profile
+    demand: Demand
+    use: Use
+    least_cores: float
+    """It gets at least this if it needs it, however full the machine is."""
+    fair_cores: float
+    """A job gets at least this while it runs. Between its jobs a task uses nothing, so that may be far more."""
+    network_s: float
+    is_owner: bool
+    is_short: bool
+    """It is the owner, and visibly lacks CPU."""
+    demands: Demands
+    now: float
 
+    def by_paper(self) -> tuple[float | None, float | None]:
+        """Eq. 1 and 2."""
+        cpu, mb, profile = self.use.cpu_cores, self.use.memory_mb, self.profile
+        need_mb = self.demand.memory_mb
+        return (
+            None if cpu is None else cpu_utility(profile.cpu_cores, cpu),
+            None if mb is None else memory_utility(profile.memory_mb, need_mb, mb - need_mb),
+        )
 
-def _memory(spec: TaskSpec, profile: Profile, demand: Demand, use: Use, form: ScoreForm) -> float | None:
-    used_mb = use.memory_mb
-    if used_mb is None:
-        return None
-    others_mb = used_mb - demand.memory_mb
-    if form is ScoreForm.PAPER:
-        return memory_utility(profile.memory_mb, demand.memory_mb, others_mb)
-    free_mb = profile.memory_mb - others_mb
-    return memory_service(free_mb, demand.memory_mb, profile.memory_mb, spec.memory_floor_ratio)
+    def by_service(self, deadline_ms: float | None) -> tuple[float | None, float | None]:
+        """The share of its jobs that the task would get done, in time where it has a deadline; whether memory fits."""
+        cpu, mb, profile, need_mb = None, self.use.memory_mb, self.profile, self.demand.memory_mb
+        if self.use.cpu_cores is not None:
+            cpu = self._cpu(profile.cpu_cores - self.use.cpu_cores, deadline_ms)
+            if self.is_short:
+                cpu = min(cpu, self.demands.given_ratio(self.spec.name, profile, self.now))
+        if mb is None:
+            return cpu, None
+        free_mb = profile.memory_mb - mb + need_mb
+        return cpu, memory_service(free_mb, need_mb, profile.memory_mb, self.spec.memory_floor_ratio)
+
+    def _cpu(self, left_cores: float, deadline_ms: float | None) -> float:
+        spec, profile, need = self.spec, self.profile, self.demand.cpu_cores
+        free, job, most = left_cores + need, self.demands.job(spec.name), None
+        share = spare_factor(left_cores, profile.cpu_cores, spec.cpu_floor_ratio)
+        if job is not None:
+            speed = speed_of(profile)
+            most = job.most_cores(speed, need)
+            if deadline_ms is not None:
+                seen_s = self.demands.seen_s(spec.name, profile, self.now) if self.is_owner else 0.0
+                job_s = max(job.age_s(speed, max(free, self.fair_cores)), seen_s) + self.network_s
+                share *= timely_worth(on_time(job_s, deadline_ms / 1e3))
+        return service_utility(free, need, profile.cpu_cores, least=self.least_cores, most=most, share=share)

@@ -14,11 +14,14 @@ from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
+from zsched.core.values.veto import Filter, Veto
 
 LOST_S = 3.0
 """Where all candidates stand at the limit of their signals, the owner is not reached for a moment now and then."""
 RESOLUTION = 1 / 1024
 """Aggregates are compared to this: half of what a tenth of a machine's free share is worth (0132)."""
+
+_UNSCORED = Veto(Filter.SCORES, "not scored by enough robots")
 
 
 def rounded(aggregate: float) -> float:
@@ -34,7 +37,7 @@ class Standing(Struct, frozen=True, kw_only=True):
     """The joint view of one gather: ``aggregates`` without bonus, ``vetoed`` with reasons, and who was heard."""
 
     aggregates: Mapping[NodeId, float]
-    vetoed: Mapping[NodeId, str]
+    vetoed: Mapping[NodeId, Veto]
     vectors: tuple[UtilityVector, ...]
     voters_heard: int
 
@@ -74,24 +77,25 @@ def compare(
     if allocation.owner is not None and (lost_for_s < LOST_S or reaches_owner(spec, allocation, vectors)):
         fresh = tuple(_with_margin(vector) for vector in told)
     columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
-    reasons: dict[NodeId, str] = {}
+    reasons: dict[NodeId, Veto] = {}
     for vector in fresh:
         for candidate, utility in {utility.candidate: utility for utility in vector.utilities}.items():
             columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
-        reasons.update(vector.refused)
+        reasons |= vector.vetoes
     mean = mean_of(allocation.tuning.aggregate)
-    vetoed: dict[NodeId, str] = {}
+    vetoed: dict[NodeId, Veto] = {}
     kept: list[NodeId] = []
     for candidate in spec.candidates:
         column = columns[candidate]
         reaching = sum(utility.reachable for utility in column)
         if len(column) < majority(len(fresh)) or len(column) == reaching < needed:
             # Not scored is not "not reached": only the latter is a reason to flee from an owner.
-            vetoed[candidate] = reasons.get(candidate, "not scored by enough robots")
+            vetoed[candidate] = reasons.get(candidate, _UNSCORED)
         elif reaching < needed:
             at_limit = _saying(candidate, told, reachable=True) - reaching
             told_of = f", by {at_limit} more at the limit of the signal (link.nu_dbm)" if at_limit else ""
-            vetoed[candidate] = f"reached by {reaching} of {len(fresh)} robots{told_of}"
+            why = f"reached by {reaching} of {len(fresh)} robots{told_of}"
+            vetoed[candidate] = Veto(Filter.REACH, why)
         else:
             kept.append(candidate)
     return Standing(

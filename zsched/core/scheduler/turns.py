@@ -3,9 +3,8 @@
 Knows: which votes are open and which commits are under way at this robot. Does not know: who is better.
 
 Planned moves and first placements take turns; after each the figures are read again, with what the moved task will use
-at its new owner (`zsched.core.scheduler.usage.Bookings`). So do flights from a machine that is short of memory
-(`ScoreForm.PAPER`). Other escapes never wait; they count the room that others are about to take
-(`zsched.core.scheduler.claims`). Robots that call votes for two tasks at the same moment are settled by name: a
+at its new owner (`zsched.core.scheduler.usage.Bookings`). Escapes never wait; they count the room that others are about
+to take (`zsched.core.scheduler.claims`). Robots that call votes for two tasks at the same moment are settled by name: a
 commit that is under way goes first, then the vote for the lower name. A vote that was won counts as a commit under way,
 whoever makes it, until its value is learnt or `Turn.awaited_until`. Nothing unsafe happens when both get through all
 the same (messages may be lost); then two tasks have moved by the same figures, once.

@@ -14,7 +14,7 @@ from zsched.core.gateway.sharing import fair_share
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.utility import predicted_use
 from zsched.core.values.fleet import Demand, TaskSpec
-from zsched.core.values.model import Allocation, NodeId, ScoreForm, TaskId
+from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.profile import MAX_CPU_CORES, MAX_MEMORY_MB, Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import GaugeName
@@ -114,14 +114,14 @@ def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: De
     Nobody measures a worker that somebody else started. At the owner its demand is taken for its use, or the owner
     would look worse by the task's own work. So is a demand of memory, whatever is measured: not all of it shows in the
     worker's processes (a GPU's, where that is the machine's, or files that it maps), and no machine could keep a task
-    whose memory counts twice there. Eq. 2 goes by what shows.
+    whose memory counts twice there.
     """
     load = profile.worker(spec.name)
     cpu, memory = (None, None) if load is None else (load.cpu_cores, load.memory_mb)
     is_at_work = profile.node == allocation.owner and (load is None or load.state is WorkerState.READY)
     if cpu is None:
         cpu = _likely_cores(spec, profile, load, demand, gateway) if is_at_work else 0.0
-    if is_at_work and (memory is None or allocation.tuning.score is ScoreForm.SERVICE):
+    if is_at_work:
         memory = max(memory or 0.0, min(profile.memory_used_mb or 0.0, demand.memory_mb))
     return Demand(cpu_cores=cpu, memory_mb=memory or 0.0)
 

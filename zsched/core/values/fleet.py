@@ -249,9 +249,8 @@ class TaskSpec:
     reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate, of the robots that answer.")
     memory_floor_ratio: float = key(
         0.05,
-        "Where a task leaves less memory free than this share, its memory counts up to 15 % less "
-        "(`score: paper`: an owner that has less is left, and a machine that would have less gets nothing while "
-        "another one would not).",
+        "Where a task leaves less memory free than this share, its memory counts up to 15 % less; "
+        "`score: paper` has no floor.",
         Range(0, MAX_FLOOR),
     )
     cpu_floor_ratio: float = key(

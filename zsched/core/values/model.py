@@ -11,12 +11,14 @@ dropped frame; from our own code it is a bug.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
-from zsched.core.values.struct import Struct
+from zsched.core.values.struct import Struct, replace
+from zsched.core.values.veto import Veto, read
 from zsched.core.values.words import A_NAME, MAX_ASKED, MAX_ASKER, NAME, PAPER_METRICS, Readings, check_range
 
 NodeId = str
@@ -287,6 +289,20 @@ class UtilityVector(Struct, frozen=True, kw_only=True):
     utilities: tuple[Utility, ...]
     refused: tuple[tuple[NodeId, str], ...] = ()
     """Candidates this voter did not score, each with its reason."""
+    filters: tuple[str, ...] = ()
+    """Which filter (`zsched.core.values.veto.Filter`) keeps out each of ``refused``; an older program tells none."""
+
+    @property
+    def vetoes(self) -> dict[NodeId, Veto]:
+        """{candidate that this voter did not score: why}."""
+        filters = itertools.chain(self.filters, itertools.repeat(None))
+        return {name: read(told, why) for (name, why), told in zip(self.refused, filters, strict=False)}
+
+    def refusing(self, vetoes: Mapping[NodeId, Veto]) -> UtilityVector:
+        """The same utilities, with these vetoes alone."""
+        told = sorted(vetoes.items())
+        refused = tuple((name, veto.why) for name, veto in told)
+        return replace(self, refused=refused, filters=tuple(veto.filter.value for _, veto in told))
 
     def __post_init__(self) -> None:
         check_name("vector.voter", self.voter)

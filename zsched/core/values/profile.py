@@ -263,6 +263,11 @@ class Profile(Struct, frozen=True, kw_only=True):
         load = self.worker(task)
         return load is not None and load.state is WorkerState.FAILED
 
+    def rests(self, task: TaskId) -> bool:
+        """Whether ``task``'s worker on this node may not work, for want of a lease, though it is ready."""
+        load = self.worker(task)
+        return load is not None and load.trouble is Trouble.RESTS
+
     def cores_of(self, task: TaskId) -> float:
         """Cores that ``task``'s worker uses on this node; 0 without a worker or a measurement."""
         load = self.worker(task)

@@ -29,12 +29,6 @@ PAPER_METRICS = ("cpu", "memory", "network")
 _INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncounted"})
 """Reasons of drops by which nobody misses a sample: a rule wants them, or the sample came by another way."""
 
-CLOCK_IN_DOUBT = "clock in doubt"
-"""Why a node may not have an exclusive task: its leases are worth nothing (`zsched.core.vote.clocks`)."""
-TOO_FEW_ELECTORS = "too few electors can give it a lease"
-"""First words of why a node may not have an exclusive task: it and a majority of them do not hear each other."""
-HAS_RESTED = "it rested there for want of a lease"
-"""Why a node may not have an exclusive task for a while (`zsched.core.scheduler.rested`)."""
 RESTS = "it rests, for it has no lease"
 """First words of what an exclusive task's owner says of its worker, which is ready."""
 COUNTED_ANEW = "since the relay's start or the stream's last change"

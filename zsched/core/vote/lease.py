@@ -44,6 +44,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from typing import Final
 
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, lease_terms
@@ -51,10 +52,12 @@ from zsched.core.values.lease import hold_s
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct
-from zsched.core.values.words import CLOCK_IN_DOUBT, TOO_FEW_ELECTORS
+from zsched.core.values.veto import Filter, Veto
 
-_IN_DOUBT = f", {CLOCK_IN_DOUBT}"
-"""Behind the terms of a node's leases."""
+_IN_DOUBT: Final = ", clock in doubt"
+"""Behind the terms of a node's leases, on the wire."""
+IN_DOUBT: Final = Veto(Filter.LEASE, "clock in doubt")
+"""Its leases are worth nothing (`zsched.core.vote.clocks`)."""
 SENT_KEPT = 128
 """Newest numbers whose sending time an owner keeps; an echo of an older one gives no lease."""
 LIVES_KEPT = 8
@@ -625,7 +628,7 @@ class Leases:
         candidates: Iterable[NodeId] = (),
         without_state: AbstractSet[NodeId] = frozenset(),
         are_apart: Callable[[NodeId, NodeId], bool] = lambda _node, _elector: False,
-    ) -> dict[NodeId, str]:
+    ) -> dict[NodeId, Veto]:
         """{node: why it could never hold a valid lease}.
 
         Args:
@@ -640,11 +643,12 @@ class Leases:
         for node in candidates:
             count = sum(not are_apart(node, elector) for elector in granting)
             if count < needed:
-                few[node] = f"{TOO_FEW_ELECTORS} ({count} of {len(self.electors)})"
+                why = f"too few electors can give it a lease ({count} of {len(self.electors)})"
+                few[node] = Veto(Filter.LEASE, why)
         return few | {
-            node: CLOCK_IN_DOUBT
+            node: IN_DOUBT
             if terms.endswith(_IN_DOUBT)
-            else f"goes by other leases ({terms or 'it does not say'}, here {self.terms})"
+            else Veto(Filter.TERMS, f"goes by other leases ({terms or 'it does not say'}, here {self.terms})")
             for node, terms in self._others.items()
         }
 

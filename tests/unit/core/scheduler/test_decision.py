@@ -17,9 +17,9 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.plays import FLEET
 from support.profiles import load_of, profile_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.values.decision import Decision, Figures
+from zsched.core.values.decision import Decision
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
-from zsched.core.values.model import NodeId, PeerState, ScoreForm, TaskId, Utility, UtilityVector
+from zsched.core.values.model import NodeId, ScoreForm, TaskId, Utility, UtilityVector
 from zsched.core.values.profile import WorkerState
 from zsched.errors import InvariantError
 from zsched.wire.codec import as_plain, from_plain
@@ -151,60 +151,6 @@ def test_too_few_robots_are_no_reason_to_say_that_nobody_else_can_have_a_task_wh
     )
     alone = replace(figures, vectors=(replace(heard, utilities=column[:1]),))
     assert decide_again(alone).judgement.reason.endswith("edge1 is starting; nobody else can have the task")
-
-
-def full(*, has_room: bool) -> Figures:
-    """An owner with 3 % of its memory free, by the paper's score; edge2 is worth most, and only edge3 may have room."""
-    tuning = tuning_of(cpu=0.5, memory=0.5, score=ScoreForm.PAPER)
-    spec = task_of(candidates=EDGES, tuning=tuning, worker=WorkerSpec(command=("worker",)))
-    free = {"edge1": 0.03, "edge2": 0.04, "edge3": 0.3 if has_room else 0.02}
-    worth = {"edge1": 0.3, "edge2": 0.9, "edge3": 0.5}
-    column = tuple(Utility(candidate=name, value=worth[name], memory=free[name]) for name in EDGES)
-    vectors = tuple(UtilityVector(voter=name, task="merge", revision=4, utilities=column) for name in ROBOTS)
-    owner = profile_of("edge1", memory_used_mb=3880.0, workers=(load_of(),))
-    return figures_of(spec, *ROBOTS, vectors=vectors, owner_profile=owner)
-
-
-def test_an_owner_short_of_memory_is_left_for_a_machine_that_is_not() -> None:
-    decided = decide_again(full(has_room=True))
-    assert (decided.judgement.candidate, decided.judgement.is_escape) == ("edge3", True)
-    assert decided.judgement.reason == "memory of edge1 is 3 % free"
-    assert decided.standing.vetoed == {"edge2": "would have 4 % of its memory free"}
-
-
-def test_where_all_are_short_of_memory_nobody_is_fled_from() -> None:
-    decided = decide_again(full(has_room=False))
-    assert (decided.escape, decided.judgement.is_escape) == (None, False)
-    assert decided.judgement.reason.startswith("edge1 owes "), "it moves as ever"
-
-
-def test_nothing_better_is_on_a_machine_that_would_be_left_for_its_memory_at_once() -> None:
-    """A task went by plan to the machine with free cores, fled from it for its memory, and so on: 12 times a minute."""
-    roomy = replace(full(has_room=True), owner_profile=profile_of("edge1", workers=(load_of(),)))
-    decided = decide_again(roomy)
-    assert decided.escape is None
-    assert decided.judgement.candidate != "edge2"
-    assert decided.standing.vetoed == {"edge2": "would have 4 % of its memory free"}
-    alone = replace(roomy, vectors=full(has_room=False).vectors)
-    assert set(decide_again(alone).standing.aggregates) == {"edge1"}, "the owner stays, though edge2 is worth more"
-    drained = replace(alone, drained="drained by ada@robot1")
-    assert decide_again(drained).judgement.candidate == "edge2", "a machine that is drained is left all the same"
-    homeless = replace(alone, allocation=replace(alone.allocation, owner=None), owner_profile=None)
-    assert decide_again(homeless).standing.vetoed == {}, "any place is better than none"
-    one_is_roomy = replace(homeless, vectors=full(has_room=True).vectors)
-    assert decide_again(one_is_roomy).judgement.reason.startswith("first placement: "), (
-        "it waits for none of the others"
-    )
-
-
-@pytest.mark.parametrize("is_gone", [True, False])
-def test_a_flight_from_short_memory_takes_its_turn_and_no_other_one_does(*, is_gone: bool) -> None:
-    """Else the lower name would always go first, and the other task stay on the short machine for good."""
-    figures = full(has_room=True)
-    figures = replace(figures, owner_state=PeerState.GONE if is_gone else figures.owner_state)
-    decided = decide_again(replace(figures, first="watch"))
-    assert decided.is_waiting_its_turn is decided.takes_turns is not is_gone
-    assert decided.judgement.reason.endswith("watch moves first") is not is_gone
 
 
 def test_of_two_tasks_that_are_short_of_memory_on_one_machine_one_leaves() -> None:

@@ -25,6 +25,7 @@ from zsched.core.scheduler.standing import LOST_S, Standing, compare
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
 from zsched.core.values.profile import Profile, WorkerState
+from zsched.core.values.veto import Filter, Veto
 
 TUNING = tuning_of(cpu=1.0, memory=0.0, bonus=0.10)
 SPEC = task_of(
@@ -33,7 +34,7 @@ SPEC = task_of(
 """A lead of 0.05 over the bonus, as in `BETTER`, has cost a move in 3.5 s: 0.175 s, and 0.075 s that are expected."""
 
 
-def standing(aggregates: Mapping[str, float], vetoed: Mapping[str, str] | None = None) -> Standing:
+def standing(aggregates: Mapping[str, float], vetoed: Mapping[str, Veto] | None = None) -> Standing:
     return Standing(aggregates=aggregates, vetoed=vetoed or {}, vectors=(), voters_heard=3)
 
 
@@ -165,7 +166,7 @@ def test_an_absence_is_held_against_a_worker_for_its_start_up_time_at_most() -> 
     starting = profile(state=WorkerState.STARTING)
     assert judge.not_ready_for(starting, 1060.5) == pytest.approx(DEADLINE_S - 6.0, abs=0.2)
     told = escape_reason(SPEC, allocation(), PeerState.ALIVE, starting, standing({}), DEADLINE_S + 0.1, judge.held_s)
-    assert told == "the worker on edge1 has not been ready for 6.1 s, and 34 s of the time before"
+    assert str(told) == "the worker on edge1 has not been ready for 6.1 s, and 34 s of the time before"
 
 
 OFTEN = ((WorkerState.STARTING, 18.0), (WorkerState.READY, 5.0)) * 2
@@ -422,12 +423,13 @@ def reason(
     seen: Profile | None = None,
     *,
     state: PeerState = PeerState.ALIVE,
-    vetoed: Mapping[str, str] | None = None,
+    vetoed: Mapping[str, Veto] | None = None,
     not_ready: float = 0.0,
     spec: TaskSpec = SPEC,
     owner: str | None = "edge1",
 ) -> str | None:
-    return escape_reason(spec, allocation(owner), state, seen, standing({}, vetoed), not_ready)
+    veto = escape_reason(spec, allocation(owner), state, seen, standing({}, vetoed), not_ready)
+    return None if veto is None else veto.why
 
 
 DEADLINE_S = SPEC.worker.start_deadline_s
@@ -513,19 +515,11 @@ def test_a_foreign_worker_that_is_not_there_is_an_escape_after_the_same_deadline
     assert reason(profile(state=None), not_ready=DEADLINE_S + 100.0, spec=FOREIGN) is None, "its daemon does not know"
 
 
-def test_an_owner_below_its_memory_floor_is_left() -> None:
-    floor = 4000.0 * (1 - SPEC.memory_floor_ratio)
-
-    assert reason(profile(memory=floor - 1.0)) is None
-    assert reason(profile(memory=floor + 40.0)) == "memory of edge1 is 4 % free"
-    assert reason(profile(memory=5000.0)) == "memory of edge1 is 0 % free"
-    assert reason(profile(memory=None)) is None
-
-
 def test_an_owner_that_too_few_robots_reach_is_left_one_that_is_not_scored_is_not() -> None:
-    assert reason(profile(), vetoed={"edge1": "reached by 1 of 3 robots"}) == "edge1 is reached by 1 of 3 robots"
-    assert reason(profile(), vetoed={"edge1": "no fresh profile"}) is None
-    assert reason(profile(), vetoed={"edge2": "reached by 0 of 3 robots"}) is None
+    few = Veto(Filter.REACH, "reached by 1 of 3 robots")
+    assert reason(profile(), vetoed={"edge1": few}) == "edge1 is reached by 1 of 3 robots"
+    assert reason(profile(), vetoed={"edge1": Veto(Filter.PROFILE, "no fresh profile")}) is None
+    assert reason(profile(), vetoed={"edge2": few}) is None
 
 
 # --- what a machine owes ---------------------------------------------------------------------------------------------

@@ -60,7 +60,18 @@ def test_a_robot_that_has_just_started_holds_nothing_against_an_owner() -> None:
 def test_each_stay_is_judged_anew() -> None:
     kept = gave((1.5, 0.5))
     look(kept, {"edge1": 0.6, "edge2": 0.88}, "edge2", 101.0)
-    assert worth_of_edge2(kept, 101.0) == pytest.approx(0.88)
+    assert worth_of_edge2(kept, 101.0) == pytest.approx(0.53, abs=0.01), "not by its first moment"
+    look(kept, {"edge1": 0.6, "edge2": 0.88}, "edge2", 101.0 + SETTLE_S)
+    assert worth_of_edge2(kept, 101.0 + SETTLE_S) == pytest.approx(0.88)
+
+
+def test_one_that_fails_again_soon_gave_half_of_that() -> None:
+    kept = gave((1.0 + SETTLE_S, 0.9))
+    for times in (1, 2, 3):
+        kept.fail("edge2", 100.0)
+        assert worth_of_edge2(kept, 100.0) == pytest.approx(0.9 / 2**times)
+        look(kept, {"edge1": 0.6, "edge2": 0.9}, "edge2", 100.5)
+        look(kept, HOME, "edge1", 101.0)
 
 
 def test_an_owner_that_cannot_be_scored_tells_nothing() -> None:

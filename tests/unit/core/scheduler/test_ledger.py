@@ -82,3 +82,11 @@ def test_nothing_is_charged_for_a_time_in_which_nobody_looked() -> None:
 def test_how_soon_a_step_is_followed_is_told() -> None:
     assert [round(left_after_s(lead, PRICE_S, 0.3), 1) for lead in (0.5, 0.1, 0.05)] == [0.2, 3.3, 7.8]
     assert left_after_s(0.0, PRICE_S, 0.3) == float("inf")
+
+
+def test_nothing_is_charged_while_the_task_is_nowhere() -> None:
+    """A machine that starts a second after the others would owe for that second, and not get the task."""
+    ledger = Ledger()
+    for tick in range(10):
+        ledger.charge({"a": 0.0, "b": 1.0}, None, price_s=PRICE_S, memory_s=200.0, now=tick * STEP_S)
+    assert ledger.owed == {"a": 0.0, "b": 0.0}

@@ -137,7 +137,7 @@ def test_nothing_is_booked_for_a_task_elsewhere_for_oneself_and_where_no_worker_
         vector = scored_b(gateway_with(*workers), agreed)
         assert value(vector, "edge1") == pytest.approx(0.5 * 0.5 + 0.5 * 2200 / 4000)
     own = load_of("b", cpu_cores=0.0, memory_mb=0.0)
-    assert value(scored_b(gateway_with(own), values(None, "edge1")), "edge1") == pytest.approx(0.525)
+    assert value(scored_b(gateway_with(own), values(None, "edge1")), "edge1") == pytest.approx(0.625)
 
 
 def test_memory_that_is_booked_cannot_be_had_twice() -> None:

@@ -165,8 +165,9 @@ def test_profile_finds_a_task_s_worker_or_none() -> None:
 
 def test_values_are_frozen_slotted_and_keyword_only() -> None:
     """No object is ever shared with an adapter that could change it."""
-    found = [cls for module in (model, profile_values, beat_values) for cls in vars(module).values()]
-    values = [cls for cls in found if isinstance(cls, type) and is_dataclass(cls)]
+    modules = (model, profile_values, beat_values)
+    found = [cls for module in modules for cls in vars(module).values() if isinstance(cls, type) and is_dataclass(cls)]
+    values = [cls for cls in found if cls.__module__ in {module.__name__ for module in modules}]
     assert len(values) > 15
     for cls in values:
         assert not cls.__dictoffset__, cls
