@@ -519,9 +519,12 @@ def _tuning(old: TaskSpec, new: TaskSpec, path: str) -> Iterator[_Verdict]:
             told = _set(AT_ONCE, f"{path}.{key}", _plain(before), _plain(after))
             objective = (f"{path}.scheduling.objective",) if one.name == "deadline_ms" else ()
             yield replace(told, paths=(*told.paths, *objective))
-    for name in TASK_RULES:
+    for name in (*TASK_RULES, "prefer"):
         if getattr(old, name) != getattr(new, name):
-            yield _set(AT_ONCE, f"{path}.scheduling.{name}", getattr(old, name), getattr(new, name))
+            yield _set(AT_ONCE, f"{path}.scheduling.{name}", _plain(getattr(old, name)), _plain(getattr(new, name)))
+    if old.beside != new.beside:
+        told = _set(AT_ONCE, f"{path}.scheduling.together", _plain(old.beside), _plain(new.beside))
+        yield replace(told, paths=(*told.paths, f"{path}.scheduling.spread"))
 
 
 _OF_A_PROCESS: Final = ("command", "env", "link", "user")

@@ -30,6 +30,10 @@ class Cast(Struct, frozen=True, kw_only=True):
     is_whole: bool
     """Every node could be read: only then does an empty selection mean something."""
 
+    def labels(self) -> tuple[str, ...]:
+        """All labels as ``key=value``, sorted."""
+        return tuple(sorted({f"{key}={value}" for node in self.nodes for key, value in node.labels}))
+
     def of_kind(self, kind: NodeKind) -> tuple[NodeId, ...]:
         """Names of all nodes of ``kind``, sorted."""
         return tuple(sorted(node.name for node in self.nodes if node.kind is kind))

@@ -262,6 +262,16 @@ SCHEDULING: Final = Record(
             "How the robots' utilities become one; `median` resists a liar.",
             default=f"`{Aggregate.MEAN}`",
         ),
+        "prefer": Field(
+            MapOf(Text("a node, or KEY=VALUE of a label"), _SHARE),
+            "How much more machines are worth, in the unit of `bonus`: `{edge1: 0.05}`, or `{gpu=yes: 0.1}` for all "
+            "with a label.",
+            default="none",
+        ),
+        "together": Field(
+            MapOf(NAME_BLOCK, _SHARE), "How much more a machine with this task is worth.", default="none"
+        ),
+        "spread": Field(MapOf(NAME_BLOCK, _SHARE), "How much less a machine with this task is worth.", default="none"),
         **keys(TaskSpec, *TASK_RULES),
     },
     removed={

@@ -43,7 +43,7 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.core.values.words import PAPER_METRICS
+from zsched.core.values.words import PAPER_METRICS, Readings
 
 _ANY_TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 """Stands in for a faulty one, so that the task's rules are checked in the same pass; such a file gives no fleet."""
@@ -72,6 +72,10 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
             _advise_domain(task.worker, entry.value, out)
             _advise_gpu(task, entry.value, out)
             _advise_gpu_limit(task, entry.value, out)
+    for one in tasks:
+        for other in (name for name, _ in one.beside if name == one.name or name not in entries):
+            here: Section = entries[one.name].value.get("scheduling")  # type: ignore[union-attr]  # it has been read
+            out.error(here.place, f"{one.name} names {other!r}, which is no other task", nearest(other, tuple(entries)))
     split = frozenset(node.name for node in cast.nodes if node.local is not None)
     for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT), split):
         _report(conflict, places, out)
@@ -90,7 +94,7 @@ def _task(
     _advise_ready(given, worker, streams, out)
     _check_mirrors(given, streams, out)
     scheduling: Section | None = given.get("scheduling")
-    more = {} if scheduling is None else _of(scheduling, *TASK_RULES)
+    more = {} if scheduling is None else {**_of(scheduling, *TASK_RULES), **_head_starts(scheduling, cast, out)}
     demand: Section | None = given.get("demand")
     gauge_limits: Section | None = given.get("limits")
     task = TaskSpec(
@@ -134,10 +138,28 @@ def _candidates(given: Section, cast: Cast, out: Collector) -> tuple[str, ...]:
     before = out.count
     candidates = select(selection, cast, out)
     if not candidates and cast.is_whole and out.count == before:
-        known = sorted({f"{key}={value}" for node in cast.nodes for key, value in node.labels})
+        known = cast.labels()
         hint = f"labels in this file: {', '.join(known[:12])}" if known else "no node of this file has a label"
         out.error(given.where("candidates"), "no node is a candidate", hint)
     return candidates
+
+
+def _head_starts(scheduling: Section, cast: Cast, out: Collector) -> dict[str, Readings]:
+    """What `prefer`, `together` and `spread` say; of a node that has several labels the largest counts."""
+    prefer: dict[str, float] = {}
+    for told, held in scheduling.get("prefer", {}).items():
+        key, is_label, value = told.partition("=")
+        nodes = [one.name for one in cast.nodes if (key, value) in one.labels] if is_label else [told]
+        if cast.is_whole and not (nodes and set(nodes) <= set(cast.names)):
+            what, known = ("label", cast.labels()) if is_label else ("node", cast.names)
+            out.error(held.place, f"there is no {what} {told!r}", nearest(told, known))
+        prefer |= {name: max(held.value or 0.0, prefer.get(name, 0.0)) for name in nodes}
+    beside = {task: held.value or 0.0 for task, held in scheduling.get("together", {}).items()}
+    for task, held in scheduling.get("spread", {}).items():
+        if task in beside:
+            out.error(held.place, f"{task!r} is under `together` as well", "leave it in one of them")
+        beside[task] = -(held.value or 0.0)
+    return {"prefer": tuple(sorted(prefer.items())), "beside": tuple(sorted(beside.items()))}
 
 
 def _tuning(given: Section, out: Collector) -> Tuning | None:

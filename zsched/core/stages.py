@@ -56,7 +56,6 @@ from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.struct import Struct
 from zsched.core.values.veto import Veto
-from zsched.core.values.words import RESTS
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.disks import Disks
 from zsched.core.vote.expiry import Expiry
@@ -344,7 +343,7 @@ class Stages:
             if self.tenure.misses_lease(self.registers[task].value, now):
                 veto = IN_DOUBT if leases.is_in_doubt else self.unfit(task, now).get(self.me)
                 why = "no majority of the electors grants one" if veto is None else veto.why
-                found[task] = f"{RESTS} ({why})"
+                found[task] = f"it rests, for it has no lease ({why})"
         return found
 
     def _doubts(self, spec: TaskSpec, now: float) -> Doubts:

@@ -1116,6 +1116,27 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_kept.py",),
     ),
     _bug(
+        "a machine that the file prefers is worth no more",
+        "zsched.core.scheduler.judge",
+        "value + head_starts.get(name, 0.0)",
+        "value",
+        ("tests/unit/core/test_closed_loop_tasks.py",),
+    ),
+    _bug(
+        "tasks that spread keep together",
+        "zsched.config.tasks",
+        "beside[task] = -(held.value or 0.0)",
+        "beside[task] = held.value or 0.0",
+        ("tests/unit/config/test_load.py",),
+    ),
+    _bug(
+        "a task of less priority holds its place",
+        "zsched.core.scheduler.usage",
+        "if other.priority < spec.priority:",
+        "if other.priority > spec.priority:",
+        ("tests/unit/core/test_closed_loop_tasks.py",),
+    ),
+    _bug(
         "a machine that fails at once, again and again, counts as if it had failed once",
         "zsched.core.scheduler.kept",
         "if before is None or is_of_now or has_settled:",

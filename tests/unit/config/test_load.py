@@ -255,6 +255,39 @@ def test_every_setting_of_a_task_arrives() -> None:
     assert (output.stream_class, output.depth, output.handover) == (StreamClass.RELIABLE, 99, HandoverRule.ALL)
 
 
+PREFERRED = swapped(
+    SCHEDULED,
+    "    scheduling: {prefer: {edge1: 0.05, site=hall: 0.1}, together: {plan: 0.2}, spread: {watch: 0.3}, "
+    "priority: 2}\n",
+).replace('labels: {gpu: "no"}', "labels: {site: hall}")
+for _name in ("plan", "watch"):
+    _task = f"  {_name}: {{candidates: {{kind: edge}}, weights: {{cpu: 1, memory: 0, network: 0}}}}\n"
+    PREFERRED = PREFERRED.replace("zenoh:", f"{_task}zenoh:")
+
+
+def test_what_a_task_prefers_is_resolved_to_nodes_and_tasks() -> None:
+    task = fleet_of(PREFERRED).task("map_merge")
+    assert task.prefer == (("edge1", 0.1),), "the larger one, where its name and a label of it are named"
+    assert task.beside == (("plan", 0.2), ("watch", -0.3))
+    assert task.priority == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("{edge1: 0.05", "{edge9: 0.05", "there is no node 'edge9'"),
+        ("site=hall: 0.1}", "site=yard: 0.1}", "there is no label 'site=yard'"),
+        ("{plan: 0.2}", "{plane: 0.2}", "map_merge names 'plane', which is no other task"),
+        ("{plan: 0.2}", "{map_merge: 0.2}", "map_merge names 'map_merge', which is no other task"),
+        ("{plan: 0.2}", "{watch: 0.2}", "'watch' is under `together` as well"),
+    ],
+)
+def test_who_prefers_what_is_not_there_is_told_so(old: str, new: str, said: str) -> None:
+    result = check(swapped(old, new, PREFERRED))
+    assert [fault.message for fault in result.faults if said in fault.message], result.report()
+    assert len(result.faults) == 1, result.report()
+
+
 @pytest.mark.parametrize(
     ("candidates", "expected"),
     [

@@ -59,6 +59,8 @@ class Work:
     job_s: float | None = None
     """CPU seconds of a job at speed 1, told by its worker; ``None``: it tells nothing."""
     deadline_ms: float | None = None
+    priority: int = 0
+    beside: tuple[tuple[str, float], ...] = ()
 
     def wanted(self, machine: Machine) -> float:
         """Cores that it would use there."""
@@ -100,6 +102,8 @@ class Tasks:
                 candidates=tuple(self.machines),
                 tuning=replace(tuning, deadline_ms=work.deadline_ms),
                 demand=Demand(cpu_cores=work.demand_cores),
+                priority=work.priority,
+                beside=work.beside,
             )
             for name, work in self.works.items()
         }
@@ -222,6 +226,7 @@ class Tasks:
             vectors=(vector,),
             owner_profile=self.gateway.fresh(allocation.owner, now),
             is_called=is_called,
+            head_starts=spec.head_starts({task: one.owner for task, one in self.values.items()}),
         )
         return decide(self.judges[name], Fuse(), figures).judgement
 
@@ -308,6 +313,25 @@ def test_tasks_that_crowd_one_machine_spread_over_the_others() -> None:
     moves = Tasks((Machine(),) * 3, works, (1, 1, 1), CPU_ONLY).run(60.0)
     assert len(moves) == 2
     assert {where for _, _, where in moves} == {"edge2", "edge3"}
+
+
+@pytest.mark.parametrize(("together", "expected"), [(0.2, ["edge1", "edge1"]), (-0.2, ["edge1", "edge2"])])
+def test_two_tasks_keep_together_or_spread_over_equal_machines(together: float, expected: list[str]) -> None:
+    """Without a word they would stay where they are."""
+    works = (Work(cores=0.3, beside=(("task2", together),)), Work(cores=0.3))
+    for owners in ((1, 1), (2, 1)):
+        fleet = Tasks((Machine(cores=4.0),) * 2, works, owners, CPU_ONLY)
+        assert len(fleet.run(60.0)) <= 1
+        assert sorted(one.owner or "" for one in fleet.values.values()) == expected
+
+
+@pytest.mark.parametrize("first", [1, 2])
+def test_where_two_tasks_lack_cpu_the_one_of_less_priority_leaves(first: int) -> None:
+    works = [Work(cores=0.8), Work(cores=0.8)]
+    works[first - 1] = replace(works[first - 1], priority=1)
+    fleet = Tasks((Machine(), Machine(speed=0.9)), tuple(works), (1, 1), CPU_ONLY)
+    moves = fleet.run(60.0)
+    assert [(which, where) for _, which, where in moves] == [(f"task{3 - first}", "edge2")]
 
 
 @pytest.mark.parametrize("capacity", [0.5, 1.0, 3.0])

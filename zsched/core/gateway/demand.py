@@ -57,6 +57,16 @@ class _Known(Struct, frozen=True):
     """When the owner's machine last had no CPU to spare."""
 
 
+class Amount(Struct, frozen=True):
+    """CPU and memory that are used, needed or coming."""
+
+    cpu_cores: float
+    memory_mb: float
+
+
+Need = Amount | Demand
+
+
 class Demands:
     """What the tasks need, as one node has learnt it."""
 
@@ -175,11 +185,13 @@ class Demands:
         known = self._known.get(task, _Known())
         return known.owner == node and now - known.since >= HOLDS_ALL_S
 
-    def at(self, spec: TaskSpec, profile: Profile) -> Demand:
+    def at(self, spec: TaskSpec, profile: Profile) -> Need:
         """The task's demand on a node: the larger of the fleet file's figure and the learnt one."""
-        known = self._known.get(spec.name, _Known())
+        known = self._known.get(spec.name)
+        if known is None:
+            return spec.demand
         cores = min((known.work or 0.0) / speed_of(profile), MAX_CPU_CORES)
-        return Demand(
+        return Amount(
             cpu_cores=max(spec.demand.cpu_cores, cores),
             memory_mb=max(spec.demand.memory_mb, known.memory_mb or 0.0),
         )

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from zsched.core.gateway.demand import Demands, speed_of
+from zsched.core.gateway.demand import Demands, Need, speed_of
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
-from zsched.core.values.fleet import Demand, Fleet, TaskSpec
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile
@@ -132,7 +132,7 @@ class Gateway:
         self.forget(task)
         self.demands.expect_another(task)
 
-    def demand(self, spec: TaskSpec, profile: Profile) -> Demand:
+    def demand(self, spec: TaskSpec, profile: Profile) -> Need:
         """The task's demand on the node of ``profile``."""
         return self.demands.at(spec, profile)
 

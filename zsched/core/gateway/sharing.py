@@ -197,7 +197,7 @@ class Shares:
             got = _Got(self._threads.get(task, max(need_cores, 1.0)), 1.0, cores)
         load = profile.worker(task)
         own = 0.0 if load is None else threads_of(load)
-        return got.kept * fair_share(cores, got.threads, max(profile.runnable - own, 0.0) + coming_cores)
+        return got.kept * fair_share(cores, got.threads, max(profile.runnable - own + coming_cores, 0.0))
 
 
 def _is_hungry(load: WorkerLoad) -> bool:

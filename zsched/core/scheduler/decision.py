@@ -68,6 +68,7 @@ def decide_by(compared: Standing, judge: Judge, fuse: Fuse, figures: Figures) ->
             now=figures.now,
             fuse=fuse,
             is_unheard=figures.owner_state is PeerState.UNKNOWN,
+            head_starts=dict(figures.head_starts),
         )
     if escape is None:
         judgement = _look_ahead(judge, judgement, standing, figures)

@@ -50,6 +50,7 @@ class CandidateSum(Struct, frozen=True, kw_only=True):
     unkept: float
     """What the machine promised so before, and did not give (`zsched.core.scheduler.kept`)."""
     bonus: float
+    """The owner's, and what the file prefers."""
     total: float | None
     owed_s: float | None = None
     """Seconds of work that the task owes there, with what it will lose; ``None``: it cannot have it."""
@@ -200,7 +201,7 @@ def _cut_off(vector: UtilityVector, node: NodeId, figures: Figures) -> UtilityVe
 def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
     """Every candidate's sum, the best first."""
     figures, standing = decision.figures, again.standing
-    owner, tuning = figures.allocation.owner, figures.allocation.tuning
+    owner, tuning, head_starts = figures.allocation.owner, figures.allocation.tuning, dict(figures.head_starts)
     needs = {need.candidate: need for need in decision.needs}
     kept = Kept.of(replace(figures.judge.kept, owner=owner))
     unkept = kept.unkept(standing.aggregates, figures.rules.memory_s, figures.now)
@@ -208,7 +209,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
     for name in figures.rules.candidates:
         is_left = name == owner and again.leaving is not None
         joint = standing.aggregates.get(name)
-        bonus = tuning.bonus if name == owner and not is_left else 0.0
+        bonus = (tuning.bonus if name == owner and not is_left else 0.0) + head_starts.get(name, 0.0)
         need = needs.get(name)
         veto = again.escape if is_left else standing.vetoed.get(name)
         is_out = joint is None or is_left

@@ -32,6 +32,7 @@ FIT_S: Final = 2.0
 """A task goes home to the node that it is pinned to once that could have had it for so long."""
 INITIAL_SETTLE_S = 3.0
 """A task without an owner waits this long for candidates that still start."""
+NO_HEAD_STARTS: Final[Mapping[NodeId, float]] = {}
 FORGIVEN_RATIO: Final = 0.1
 """An owner's worker that is ready makes up so much of the time in which it was not."""
 
@@ -162,6 +163,7 @@ class Judge:
         fuse: Fuse | None = None,
         drained: str = "",
         is_unheard: bool = False,
+        head_starts: Mapping[NodeId, float] = NO_HEAD_STARTS,
     ) -> Judgement:
         """Decide by one standing.
 
@@ -174,13 +176,16 @@ class Judge:
             fuse: the task's record of moves; ``None``: they are not bounded.
             drained: why the owner hands the task over, by an operator's order; empty: it need not.
             is_unheard: nobody here has ever heard the owner.
+            head_starts: {candidate: how much more it is worth, by the file}.
         """
         owner = allocation.owner
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
         self.kept.look(standing.aggregates, owner, now)
         given = self.kept.corrected(standing.aggregates, owner, self.spec.memory_s, now)
-        worth = {name: value + (allocation.tuning.bonus if name == owner else 0.0) for name, value in given.items()}
+        worth = {name: value + head_starts.get(name, 0.0) for name, value in given.items()}
+        if owner in worth:
+            worth[owner] += allocation.tuning.bonus
         home = allocation.home
         scored = {
             name: value

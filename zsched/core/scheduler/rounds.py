@@ -36,7 +36,16 @@ from zsched.core.todo import ToDo
 from zsched.core.values.decision import Decision, Figures, Need, Rules
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.messages import Utilities
-from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, Tuning, UtilityVector
+from zsched.core.values.model import (
+    MAX_AGGREGATE,
+    Allocation,
+    NodeId,
+    PeerState,
+    Proposal,
+    TaskId,
+    Tuning,
+    UtilityVector,
+)
 from zsched.core.values.struct import Struct
 
 HEARD = (PeerState.ALIVE, PeerState.SUSPECT)
@@ -355,7 +364,7 @@ class Rounds:
             task=task.spec.name,
             base_revision=allocation.revision,
             candidate=judgement.candidate,
-            aggregate=judgement.aggregate,
+            aggregate=min(max(judgement.aggregate, 0.0), MAX_AGGREGATE),
             is_escape=judgement.is_escape,
             reason=judgement.reason[:200],
         )
@@ -400,6 +409,7 @@ class Rounds:
             closed=tuple(sorted(self._flags.closed.items())),
             claimed=tuple(sorted(self._claimed(task.spec, values, states, now).items())),
             drained="" if owner is None else self._flags.drained.get(owner, ""),
+            head_starts=task.spec.head_starts({other: one.owner for other, one in values.items()}),
             judge=task.judge.memory(),
             fuse=task.fuse.memory(),
         )

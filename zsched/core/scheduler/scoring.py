@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 
-from zsched.core.gateway.demand import Demands, speed_of
+from zsched.core.gateway.demand import Demands, Need, speed_of
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.eligibility import (
@@ -33,7 +33,7 @@ from zsched.core.scheduler.utility import (
     timely_worth,
     total_utility,
 )
-from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.gauges import BY_NAME
 from zsched.core.values.model import (
     Allocation,
@@ -203,7 +203,11 @@ class _View:
         link = self._link(candidate)
         if link is not None and not link.is_reached:
             return None
-        fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
+        others = () if self._bookings is None else self._bookings.get(candidate, ())
+        if any(other.priority > spec.priority for other in others):
+            fair = 0.0
+        else:
+            fair = gateway.share(spec, profile, demand.cpu_cores, coming.cpu_cores)
         load = profile.worker(spec.name)
         # what an owner that is short gets is measured
         is_measured = is_owner and load is not None and is_short(load)
@@ -315,7 +319,7 @@ class _Worth(Struct, frozen=True):
 
     spec: TaskSpec
     profile: Profile
-    demand: Demand
+    demand: Need
     use: Use
     least_cores: float
     """It gets at least this if it needs it, however full the machine is."""

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from zsched.core.gateway.company import is_full
+from zsched.core.gateway.demand import Amount, Need
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.scheduler.utility import predicted_use
-from zsched.core.values.fleet import Demand, TaskSpec
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.profile import MAX_CPU_CORES, MAX_MEMORY_MB, Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct
@@ -24,7 +25,7 @@ Bookings = Mapping[NodeId, tuple[TaskSpec, ...]]
 
 GPU_SHOWS_S = 3.0
 """Time constant with which a task's use of the GPU shows: that of the gauges' means, and they are read every 2 s."""
-_NOTHING = Demand()
+_NOTHING = Amount(cpu_cores=0.0, memory_mb=0.0)
 
 
 def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Bookings:
@@ -39,8 +40,8 @@ def book(specs: Iterable[TaskSpec], values: Mapping[TaskId, Allocation]) -> Book
 
 
 def coming_use(
-    spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float, own: Demand | None
-) -> Demand:
+    spec: TaskSpec, profile: Profile, bookings: Bookings | None, gateway: Gateway, now: float, own: Amount | None
+) -> Amount:
     """What other tasks will use on a node beyond what its profile shows of their workers.
 
     Of a worker that somebody else started no profile says what it uses. What it brings from another node is coming as
@@ -71,7 +72,9 @@ def coming_use(
             # what it had come to use ended with it; what the file asks for stays reserved, but see below
             demand = other.demand if load.state is WorkerState.FAILED else gateway.demand(other, profile)
             unshown = 1.0 if other.worker.command else gateway.demands.unshown_ratio(other.name, profile.node, now)
-            if not (is_full(profile) and is_short(load)):
+            if other.priority < spec.priority:
+                cpu -= load.cpu_cores or 0.0  # it gives way
+            elif not (is_full(profile) and is_short(load)):
                 cpu += unshown * max(demand.cpu_cores - (load.cpu_cores or 0.0), 0.0)
             unshown_mb = unshown * max(demand.memory_mb - (load.memory_mb or 0.0), 0.0)
             is_working = other.worker.command and load.state is WorkerState.READY
@@ -81,10 +84,10 @@ def coming_use(
                 memory += unshown_mb
     if own is not None and hidden_mb > 0.0:
         memory += max(hidden_mb - _unseen_mb(spec, profile, own), 0.0)
-    return Demand(cpu_cores=min(cpu, MAX_CPU_CORES), memory_mb=min(memory, MAX_MEMORY_MB))
+    return Amount(cpu_cores=min(cpu, MAX_CPU_CORES), memory_mb=min(memory, MAX_MEMORY_MB))
 
 
-def _unseen_mb(spec: TaskSpec, profile: Profile, own: Demand) -> float:
+def _unseen_mb(spec: TaskSpec, profile: Profile, own: Amount) -> float:
     """Memory in use that no worker's processes show, without the task's ``own``."""
     shown_mb = sum(load.memory_mb or 0.0 for load in profile.workers)
     load = profile.worker(spec.name)
@@ -99,7 +102,7 @@ class Use(Struct, frozen=True):
     memory_mb: float | None
 
 
-def predicted(profile: Profile, own: Demand, demand: Demand, coming: Demand) -> Use:
+def predicted(profile: Profile, own: Amount, demand: Need, coming: Amount) -> Use:
     """What would be in use on the node with the task, of which ``own`` is in use now, and with what is ``coming``."""
     cpu, memory = profile.cpu_used_cores, profile.memory_used_mb
     return Use(
@@ -108,7 +111,7 @@ def predicted(profile: Profile, own: Demand, demand: Demand, coming: Demand) -> 
     )
 
 
-def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Demand, gateway: Gateway) -> Demand:
+def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: Need, gateway: Gateway) -> Amount:
     """What of a node's use is the task's own.
 
     Nobody measures a worker that somebody else started. At the owner its demand is taken for its use, or the owner
@@ -123,10 +126,10 @@ def own_use(spec: TaskSpec, allocation: Allocation, profile: Profile, demand: De
         cpu = _likely_cores(spec, profile, load, demand, gateway) if is_at_work else 0.0
     if is_at_work:
         memory = max(memory or 0.0, min(profile.memory_used_mb or 0.0, demand.memory_mb))
-    return Demand(cpu_cores=cpu, memory_mb=memory or 0.0)
+    return Amount(cpu_cores=cpu, memory_mb=memory or 0.0)
 
 
-def _likely_cores(spec: TaskSpec, profile: Profile, load: WorkerLoad | None, demand: Demand, gateway: Gateway) -> float:
+def _likely_cores(spec: TaskSpec, profile: Profile, load: WorkerLoad | None, demand: Need, gateway: Gateway) -> float:
     """What a worker without a figure uses at the owner: its demand, as far as the machine gives it that."""
     use = profile.cpu_used_cores or 0.0
     if load is not None and load.jobs is not None and is_short(load):

@@ -12,6 +12,7 @@ from zsched.core.values.model import Allocation, NodeId, PeerState, Reach, TaskI
 from zsched.core.values.profile import Profile
 from zsched.core.values.snapshot import VoteStatus
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import Readings
 
 
 class Rules(Struct, frozen=True, kw_only=True):
@@ -97,6 +98,8 @@ class Figures(Struct, frozen=True, kw_only=True):
     has lost its owner, which leaves it to them while it has another place."""
     drained: str = ""
     """Why the owner hands the task over, by an operator's flag; empty: it need not."""
+    head_starts: Readings = ()
+    """(candidate, how much more or less than its figures say it is worth), by the file; sorted."""
     judge: JudgeMemory = JudgeMemory()
     fuse: FuseMemory = FuseMemory()
 

@@ -9,7 +9,7 @@ fleet file gets that says nothing else.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
@@ -227,7 +227,7 @@ class LinkLimits:
     )
 
 
-TASK_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s", "memory_s")
+TASK_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s", "memory_s", "priority")
 """Keys of `scheduling` that are fields of `TaskSpec`, under the same name."""
 TUNED_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s")
 TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair")
@@ -268,6 +268,16 @@ class TaskSpec:
     max_moves_per_minute: int = 6
     """A fuse, whatever the figures say; no file sets it."""
     memory_s: float = key(1000.0, "Half of what is held against a machine is forgotten in it.", Range(1, 86400, "s"))
+    priority: int = key(
+        0,
+        "Where CPU is short: what tasks of less priority use on a machine counts as free, and beside one of more "
+        "priority the task counts on no fair share.",
+        Range(-100, 100),
+    )
+    prefer: Readings = ()
+    """(node, how much more it is worth), sorted; labels are resolved by `zsched.config.tasks`."""
+    beside: Readings = ()
+    """(task, how much more the machine that it is on is worth; less than 0: it is worth less), sorted."""
     on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
     exclusive: bool = key(
         False,
@@ -288,6 +298,15 @@ class TaskSpec:
         if self.rollout is None or node in self.rollout.first:
             return self.worker
         return replace(self.worker, command=self.rollout.command, env=self.rollout.env)
+
+    def head_starts(self, owners: Mapping[TaskId, NodeId | None]) -> Readings:
+        """(candidate, how much more or less than its figures say it is worth), sorted; ``owners``: of all tasks."""
+        found = {name: more for name, more in self.prefer if name in self.candidates}
+        for task, more in self.beside:
+            node = owners.get(task)
+            if node in self.candidates:
+                found[node] = found.get(node, 0.0) + more
+        return tuple(sorted(found.items()))
 
     def under(self, tuning: Tuning) -> TaskSpec:
         """This task as operators have tuned it: what they have not set is the file's.

@@ -157,7 +157,7 @@ class Weights(Struct, frozen=True, kw_only=True):
 
 
 MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
-MAX_PRICE_S, MAX_FLOOR = 1000.0, 0.9
+MAX_PRICE_S, MAX_FLOOR, MAX_AGGREGATE = 1000.0, 0.9, 2.0
 
 
 class Tuning(Struct, frozen=True, kw_only=True):
@@ -330,7 +330,7 @@ class Proposal(Struct, frozen=True, kw_only=True):
         check_name("proposal.task", self.task)
         check_name("proposal.candidate", self.candidate)
         check_counter("proposal.base_revision", self.base_revision)
-        check_range("proposal.aggregate", self.aggregate, 0.0, 2.0)
+        check_range("proposal.aggregate", self.aggregate, 0.0, MAX_AGGREGATE)
 
 
 # --- VOTE: the register ----------------------------------------------------------------------------------------------

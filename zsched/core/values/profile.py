@@ -18,7 +18,7 @@ from zsched.core.values.model import (
     check_readings,
 )
 from zsched.core.values.struct import Struct, replace
-from zsched.core.values.words import RESTS, Readings, Trouble, check_range
+from zsched.core.values.words import Readings, Trouble, check_range
 
 MAX_CPU_CORES, MAX_MEMORY_MB, MAX_BITRATE_MBPS = 4096.0, 1e8, 1e6
 MIN_SPEED, MAX_SPEED = 0.001, 1000.0
@@ -275,7 +275,7 @@ class Profile(Struct, frozen=True, kw_only=True):
 
 
 # Goes with the next release: a daemon of the one before tells a worker's trouble by the first words of its reason.
-_OLD_WORDS = {"was ready until ": Trouble.LOST, "restarting": Trouble.AGAIN, RESTS: Trouble.RESTS}
+_OLD_WORDS = {"was ready until ": Trouble.LOST, "restarting": Trouble.AGAIN, "it rests, for it": Trouble.RESTS}
 
 
 def with_troubles(profile: Profile) -> Profile:

@@ -29,8 +29,6 @@ PAPER_METRICS = ("cpu", "memory", "network")
 _INTENDED = frozenset({"cut", "loop", "retried", "superseded", "thinned", "uncounted"})
 """Reasons of drops by which nobody misses a sample: a rule wants them, or the sample came by another way."""
 
-RESTS = "it rests, for it has no lease"
-"""First words of what an exclusive task's owner says of its worker, which is ready."""
 COUNTED_ANEW = "since the relay's start or the stream's last change"
 """A stream keeps its count over both, so a message in it may have come before."""
 

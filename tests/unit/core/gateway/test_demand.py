@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
-from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands
+from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands, Need
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.job_need import crowd
 from zsched.core.values.fleet import Demand
@@ -40,7 +40,7 @@ def profile(
     )
 
 
-def learnt(*profiles: Profile, there: Profile | None = None, every_s: float = EVERY_S) -> Demand:
+def learnt(*profiles: Profile, there: Profile | None = None, every_s: float = EVERY_S) -> Need:
     """What is needed on ``there`` after one look at each of ``profiles``."""
     demands = Demands()
     for number, one in enumerate(profiles):

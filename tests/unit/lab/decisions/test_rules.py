@@ -17,7 +17,7 @@ from zsched_lab.decisions import entries
 from zsched_lab.decisions.replay import Entry, replay
 from zsched_lab.decisions.report import STARS
 from zsched_lab.decisions.rules import BlindRule, CoreRule, Move, PickRule, drawn, first_match, fixed
-from zsched_lab.decisions.view import START_S, Feed, Look, View
+from zsched_lab.decisions.view import Feed, Look, View
 from zsched_lab.decisions.world import DT_S, EVEN, World, equal_world, loaded_world
 
 STEP_AT_S = 60.0
@@ -74,21 +74,6 @@ def test_no_rule_of_ours_flees_for_memory_to_a_machine_that_would_lack_it_too() 
         ((move,), (fled,)) = (only(short_of_memory(0.96, ratio), entry) for ratio in (0.92, 0.4))
         assert not move.is_escape, entry.name
         assert move.at_s > fled.at_s, entry.name
-
-
-def test_an_escape_is_kept_apart_from_planned_moves() -> None:
-    """Else six of them in a minute would hold every planned move back."""
-    world = short_of_memory(0.97, 0.4)
-    view = View(world, feed := Feed(world, Look()))
-    rule = CoreRule(view, Tuning(weights=EVEN))
-    for step in range(world.steps):
-        feed.step(step)
-        rule.round((0,) if step % 5 == 0 else (), step * DT_S, now := START_S + step * DT_S)
-        if len(rule.moves) == 2:
-            break
-    (first, fled) = rule.moves
-    assert (first.owner, fled.left, fled.is_escape) == ("edge001", "edge001", True)
-    assert [rule._fuse.moves_within(60.0, now, escapes=is_escape) for is_escape in (True, False)] == [1, 0]
 
 
 def test_a_move_that_costs_more_waits_longer() -> None:
