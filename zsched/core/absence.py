@@ -1,7 +1,7 @@
 """Something that has to be there and is away again and again: when it has been away for too long, in all.
 
-Knows: times. Does not know: what is away (`zsched.core.scheduler.judge`, `zsched.core.scheduler.rested`,
-`zsched.core.scheduler.unseen`, `zsched.core.executor.tenure`).
+Knows: times. Does not know: what is away (`zsched.core.scheduler.judge`, `zsched.core.scheduler.unseen`,
+`zsched.core.executor.tenure`).
 
 What is there now and then, and never for long, would have its whole time anew for each absence, and be waited for
 without end. So absences add up.

@@ -71,7 +71,7 @@ class World:
         """True signals [T, R, C] between robots and candidates.
 
         Through one access point the delays of both ways add up. The robots' own ways are part of that whichever node
-        has the task; what is decided about is the candidate's way, so that is what counts (docs/decisions/0018).
+        has the task; what is decided about is the candidate's way, so that is what counts.
         """
         if self.signal is None or self.signal.ndim == 3:
             return self.signal

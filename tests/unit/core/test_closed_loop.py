@@ -434,7 +434,7 @@ def test_a_load_that_goes_away_may_bring_the_task_back_once() -> None:
 # --- scored by service ---------------------------------------------------------------------------------------------
 
 BY_SERVICE = Tuning(weights=BOTH, score=ScoreForm.SERVICE, bonus=DEFAULT_BONUS)
-"""What a task gets whose fleet file says nothing (docs/decisions/0030)."""
+"""What a task gets whose fleet file says nothing."""
 CPU_ONLY = Weights(cpu=1.0, memory=0.0, network=0.0)
 
 
@@ -758,7 +758,7 @@ def test_a_task_whose_jobs_wait_for_each_other_comes_to_rest(
 ) -> None:
     """A quick machine far away keeps the deadline, and by its short queue the slow one nearby would keep it as well.
 
-    By the owner's queue alone the examples are limit cycles of 19 to 38 moves (docs/decisions/0123).
+    By the owner's queue alone the examples are limit cycles of 19 to 38 moves in 400 s (docs/decisions/0139).
     """
     near = replace(QUEUES, queueing=queueing)
     far = replace(near, name="edge2", speed=speed, signal_dbm=far_dbm)

@@ -3,8 +3,8 @@
 Knows: links that were measured directly, the two ways of a pair that meet at an access point, ways that nobody
 has measured yet. Does not know: weights, who may have the task, how signals are smoothed.
 
-Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead, and
-What it is *worth* depends on the task's reading of a pair (docs/decisions/0018).
+Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead.
+What it is *worth* depends on the task's reading of a pair.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def pair_link(
     """Eq. 3 for one (robot, candidate) pair, or ``None`` when nobody measured it.
 
     A candidate is at its limit up to ``margin_db`` above nu, the access point by the robot's own radio up to
-    ``own_margin_db`` above it (docs/decisions/0130).
+    ``own_margin_db`` above it.
 
     A link measured between the two counts as it is, from either end. Else both reach each other through one access
     point, and ``limits.pair`` says how the two ways become one.

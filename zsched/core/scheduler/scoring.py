@@ -51,7 +51,7 @@ from zsched.core.values.words import GaugeName
 
 REACH_MARGIN_DB = 3.0
 """A candidate is at its limit up to so much above nu: twice what a smoothed signal scatters by. While the robots reach
-the owner it does not count there, so that a signal that stands about nu moves a task once (docs/decisions/0130)."""
+the owner it does not count there, so that a signal that stands about nu moves a task once."""
 
 
 _NAMES = {
@@ -298,7 +298,7 @@ def _gauges(allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[s
 def _spare_gpu(spec: TaskSpec, allocation: Allocation, terms: dict[NodeId, _Terms]) -> None:
     """Of a task whose use of the GPU nobody knows: let the owner's be worth as much as the best of the others'.
 
-    Else it would look worse by the task's own work, which would follow the task wherever it goes (0120).
+    Else it would look worse by the task's own work, which would follow the task wherever it goes.
     """
     owner = allocation.owner
     if owner is None or owner not in terms or spec.demand.gpu:

@@ -19,7 +19,7 @@ from zsched.core.values.veto import Filter, Veto
 LOST_S = 3.0
 """Where all candidates stand at the limit of their signals, the owner is not reached for a moment now and then."""
 RESOLUTION = 1 / 1024
-"""Aggregates are compared to this: half of what a tenth of a machine's free share is worth (0132)."""
+"""Aggregates are compared to this: half of what a tenth of a machine's free share is worth."""
 
 _UNSCORED = Veto(Filter.SCORES, "not scored by enough robots")
 

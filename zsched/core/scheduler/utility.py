@@ -6,8 +6,8 @@ The equations as printed contradict the text in places (Eq. 1 with beta "availab
 beta and mu are what is *in use*, predicted as if the candidate had the task, and every term is clamped to [0, 1].
 
 That clamp makes all machines alike that have less left than the task needs, idle or starved, and in a sum spare memory
-hides a starved CPU. `ScoreForm.SERVICE` (docs/decisions/0030) says which share of its work a task would get done, which
-is never 0 before nothing is left, and multiplies.
+hides a starved CPU. `ScoreForm.SERVICE` says which share of its work a task would get done, which is never 0 before
+nothing is left, and multiplies.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ LEAST_NEED_RATIO = 0.05
 """Of what is free a task counts as needing at least this share of a machine: also of a small one more is better."""
 SPARE = 0.02
 """The part of a term that is the machine's free share: enough to place tasks apart, and less than the default bonus in
-CPU and memory together, so a task that lacks nothing does not move for more room (docs/decisions/0132)."""
+CPU and memory together, so a task that lacks nothing does not move for more room."""
 
 
 def service_utility(

@@ -39,7 +39,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import Readings
 
 DEFAULT_SCORE = ScoreForm.SERVICE
-"""How to score a machine when the fleet file does not say (docs/decisions/0031)."""
+"""How to score a machine when the fleet file does not say."""
 DEFAULT_BONUS = 0.05
 """The bonus of a task whose fleet file gives none."""
 FEWEST_SIGNS, MOST_SIGNS = 3, 4

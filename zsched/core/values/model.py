@@ -108,7 +108,7 @@ class Reach(StrEnum):
 
 
 class PairReading(StrEnum):
-    """How to value a link whose two ends reach each other through one access point (docs/decisions/0018)."""
+    """How to value a link whose two ends reach each other through one access point."""
 
     CANDIDATE = "candidate"
     """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
@@ -264,7 +264,7 @@ class Utility(Struct, frozen=True, kw_only=True):
     gauges: Readings = ()
     """The terms of the gauges that the task weighs."""
     at_limit: bool = False
-    """Reached, but with so weak a signal that it is not while the task has an owner that the robots reach (0130)."""
+    """Reached, but with so weak a signal that it is not while the task has an owner that the robots reach."""
 
     def __post_init__(self) -> None:
         check_name("utility.candidate", self.candidate)

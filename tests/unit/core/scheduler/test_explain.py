@@ -42,7 +42,7 @@ TERMS = {"edge1": (0.9, 0.8, 0.7), "edge2": (0.95, 0.9, 0.5), "edge3": (0.4, 0.9
 
 
 def value_of(terms: tuple[float, float, float], tuning: Tuning) -> float:
-    """By hand, as docs/decisions/0030 and Eq. 4 have it."""
+    """By hand, as `service_utility` and Eq. 4 have it."""
     weights = (tuning.weights.cpu, tuning.weights.memory, tuning.weights.network)
     if tuning.score is ScoreForm.PAPER:
         return sum(weight * term for weight, term in zip(weights, terms, strict=True)) / sum(weights)

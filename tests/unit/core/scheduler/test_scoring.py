@@ -634,7 +634,7 @@ def test_a_path_with_a_dead_end_is_dead_by_every_reading(pair: PairReading, dead
 
 
 def test_of_three_robots_the_best_and_the_second_best_tie_by_the_weaker_way_only() -> None:
-    """Why `weaker` is not the default: it cannot tell the two best of three robots apart (docs/decisions/0018)."""
+    """Why `weaker` is not the default: it cannot tell the two best of three robots apart."""
     signals = {"robot1": -45.0, "robot2": -65.0, "robot3": -75.0}
     leads = {}
     for pair in PairReading:
