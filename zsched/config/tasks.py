@@ -319,10 +319,8 @@ def _advise_gpu(task: TaskSpec, given: Section, out: Collector) -> None:
     if task.demand.gpu or not (is_weighed or is_limited):
         return
     section: Section = given.get("weights" if is_weighed else "limits")
-    message = (
-        f"the GPU has a {'weight' if is_weighed else 'limit'}, but nothing says how much of it the task uses, and "
-    )
-    message += "no driver tells: the GPU counts in where the task goes, and the task does not leave its owner for it"
+    what, then = ("weight", "it counts nothing") if is_weighed else ("limit", "it only asks for a GPU")
+    message = f"the GPU has a {what}, but nothing says how much of it the task uses, and no driver tells: {then}"
     hint = "demand: {gpu: 0.3} (its share of one GPU; `zsched status` shows a machine's use with and without the task)"
     out.warn(section.where(gpu.name), message, hint)
 

@@ -901,8 +901,8 @@ VOTE_BUGS = (
     _bug(
         "bonus twice",
         SCHEDULER,
-        "(allocation.tuning.bonus if name == owner else 0.0)",
-        "(2 * allocation.tuning.bonus if name == owner else 0.0)",
+        "worth[owner] += allocation.tuning.bonus",
+        "worth[owner] += 2 * allocation.tuning.bonus",
         _SCHEDULER,
     ),
     _bug(
@@ -1153,8 +1153,8 @@ VOTE_BUGS = (
     _bug(
         "a task's own thread takes from its share where it runs",
         "zsched.core.gateway.sharing",
-        "max(profile.runnable - own, 0.0) + coming_cores)",
-        "profile.runnable + coming_cores)",
+        "max(profile.runnable - own + coming_cores, 0.0))",
+        "max(profile.runnable + coming_cores, 0.0))",
         ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(

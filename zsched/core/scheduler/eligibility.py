@@ -6,7 +6,7 @@ node is worth (`zsched.core.scheduler.scoring`), who reaches it, what others say
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Final
 
@@ -178,15 +178,13 @@ def is_far_beyond(spec: TaskSpec, gauges: Mapping[GaugeName, float]) -> bool:
 
     Whatever is nearer to the limit than that would soon be left for it again.
     """
-    return any(BY_NAME[name].is_far_beyond(gauges.get(name), limit) for name, limit in _owner_limits(spec).items())
+    return any(BY_NAME[name].is_far_beyond(gauges.get(name), limit) for name, limit in _limits(spec))
 
 
-def _owner_limits(spec: TaskSpec) -> dict[GaugeName, float]:
-    """An owner whose GPU may be busy with the task alone, for all that is known, is not left for that."""
-    limits = dict(spec.gauge_limits)
-    if "gpu" in limits and not spec.demand.gpu:
-        limits["gpu"] = BY_NAME["gpu"].high
-    return limits
+def _limits(spec: TaskSpec) -> Iterator[tuple[GaugeName, float]]:
+    """Where nothing says how much of a GPU the task uses, a limit of the GPU only asks for one."""
+    for name, limit in spec.gauge_limits:
+        yield name, limit if name != "gpu" or spec.demand.gpu else BY_NAME[name].high
 
 
 def _beyond_limits(case: Case, *, has_margin: bool) -> str:
@@ -194,7 +192,6 @@ def _beyond_limits(case: Case, *, has_margin: bool) -> str:
     if not case.spec.gauge_limits or case.profile is None:
         return ""
     spec, told = case.spec, dict(possible(case.profile.gauges))
-    limits = _owner_limits(spec) if case.is_owner else dict(spec.gauge_limits)
     faults = (
         BY_NAME[name].fault(
             case.gauges.get(name),
@@ -203,6 +200,6 @@ def _beyond_limits(case: Case, *, has_margin: bool) -> str:
             is_reckoned=name == "gpu" and bool(spec.demand.gpu) and not case.is_owner,
             is_old=name not in told,
         )
-        for name, limit in limits.items()
+        for name, limit in _limits(spec)
     )
     return next((fault for fault in faults if fault), "")

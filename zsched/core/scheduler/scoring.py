@@ -125,7 +125,6 @@ def score(
             vetoes[candidate] = found
         else:
             terms[candidate] = found
-    _spare_gpu(spec, allocation, terms)
     _spare_own_link(voter, terms)
     utilities, unmeasured = _weighed(allocation.tuning, terms)
     utilities += [Utility(candidate=name, value=0.0, reachable=False) for name in unreachable]
@@ -227,7 +226,7 @@ class _View:
         tuning = allocation.tuning
         is_paper = tuning.score is ScoreForm.PAPER
         cpu, memory = worth.by_paper() if is_paper else worth.by_service(tuning.deadline_ms)
-        weighed, at_limit = _gauges(allocation, gauges), link is not None and link.at_limit
+        weighed, at_limit = _gauges(spec, allocation, gauges), link is not None and link.at_limit
         return _Terms(cpu, memory, None if link is None else link.utility, weighed, at_limit)
 
     def _link(self, candidate: NodeId) -> PairLink | None:
@@ -287,26 +286,15 @@ def _spare_own_link(voter: NodeId, terms: dict[NodeId, _Terms]) -> None:
             terms[name] = replace(term, network=None)
 
 
-def _gauges(allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[str, float]:
-    """The terms of the weighed gauges that this node measures."""
+def _gauges(spec: TaskSpec, allocation: Allocation, gauges: Mapping[GaugeName, float]) -> dict[str, float]:
+    """The terms of the weighed gauges that this node measures; none of a GPU of which nothing says what the task uses.
+
+    Its owner would look worse by the task's own work, which would follow the task wherever it goes.
+    """
     if not allocation.tuning.weights.gauges:
         return {}
-    weighed = {name for name, _ in allocation.tuning.weights.gauges}
+    weighed = {name for name, _ in allocation.tuning.weights.gauges if name != "gpu" or spec.demand.gpu}
     return {name: BY_NAME[name].term(reading) for name, reading in gauges.items() if name in weighed}
-
-
-def _spare_gpu(spec: TaskSpec, allocation: Allocation, terms: dict[NodeId, _Terms]) -> None:
-    """Of a task whose use of the GPU nobody knows: let the owner's be worth as much as the best of the others'.
-
-    Else it would look worse by the task's own work, which would follow the task wherever it goes.
-    """
-    owner = allocation.owner
-    if owner is None or owner not in terms or spec.demand.gpu:
-        return
-    own = terms[owner]
-    if "gpu" in own.gauges:
-        best = max(term.gauges["gpu"] for term in terms.values() if "gpu" in term.gauges)
-        terms[owner] = replace(own, gauges={**own.gauges, "gpu": best})
 
 
 def _is_assumed(name: str) -> bool:

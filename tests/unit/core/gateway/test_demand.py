@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from zsched.core.gateway.company import STARVED_CPU_RATIO
-from zsched.core.gateway.demand import SETTLE_S, UNSURE, Demands, Need
+from zsched.core.gateway.demand import SETTLE_S, UNSURE, Amount, Demands, Need
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.job_need import crowd
 from zsched.core.values.fleet import Demand
@@ -65,20 +65,20 @@ def test_before_any_measurement_the_fleet_file_s_figure_counts_on_every_machine(
 def test_demand_is_the_larger_of_the_fleet_file_and_the_measurement(
     used: tuple[float | None, float | None], demand: tuple[float, float]
 ) -> None:
-    assert learnt(profile(*used)) == Demand(cpu_cores=demand[0], memory_mb=demand[1])
+    assert learnt(profile(*used)) == Amount(cpu_cores=demand[0], memory_mb=demand[1])
 
 
 def test_the_newest_measurement_replaces_the_older_ones() -> None:
     first = profile(2.0, 900.0)
-    assert learnt(first, first, profile(0.5, 300.0)) == Demand(cpu_cores=0.5, memory_mb=300.0)
+    assert learnt(first, first, profile(0.5, 300.0)) == Amount(cpu_cores=0.5, memory_mb=300.0)
 
 
 def test_what_a_task_uses_where_it_has_just_come_is_the_least_that_it_needs() -> None:
     """Its figures are smoothed and start from nothing; more than was known counts at once."""
     settled, rising = profile(2.0, 900.0), profile(0.3, 100.0, node="edge2")
-    assert learnt(settled, rising) == Demand(cpu_cores=2.0, memory_mb=900.0)
-    assert learnt(settled, rising, rising, every_s=SETTLE_S) == Demand(cpu_cores=0.4, memory_mb=250.0)
-    assert learnt(settled, profile(3.0, 1000.0, node="edge2")) == Demand(cpu_cores=3.0, memory_mb=1000.0)
+    assert learnt(settled, rising) == Amount(cpu_cores=2.0, memory_mb=900.0)
+    assert learnt(settled, rising, rising, every_s=SETTLE_S) == Amount(cpu_cores=0.4, memory_mb=250.0)
+    assert learnt(settled, profile(3.0, 1000.0, node="edge2")) == Amount(cpu_cores=3.0, memory_mb=1000.0)
 
 
 def test_a_starved_owner_shows_the_least_that_its_task_needs() -> None:
@@ -120,7 +120,7 @@ def test_a_machine_that_nobody_has_timed_counts_as_one_of_speed_1() -> None:
 @pytest.mark.parametrize("state", [WorkerState.STOPPED, WorkerState.STARTING, WorkerState.FAILED])
 def test_a_task_does_not_cost_less_because_its_worker_restarts(state: WorkerState) -> None:
     known, restarting = profile(1.5, 600.0), profile(0.0, 20.0, state=state)
-    assert learnt(known, known, restarting) == Demand(cpu_cores=1.5, memory_mb=600.0)
+    assert learnt(known, known, restarting) == Amount(cpu_cores=1.5, memory_mb=600.0)
 
 
 def test_a_worker_that_is_ready_again_has_time_to_use_what_it_needs() -> None:
@@ -131,15 +131,15 @@ def test_a_worker_that_is_ready_again_has_time_to_use_what_it_needs() -> None:
     demands.learn("merge", profile(0.0, 20.0, state=WorkerState.STARTING), 2 * EVERY_S)
     for after_s in (0.5, 0.5 + 0.9 * SETTLE_S):
         demands.learn("merge", again, 2 * EVERY_S + after_s)
-        assert demands.at(TASK, again) == Demand(cpu_cores=1.5, memory_mb=600.0)
+        assert demands.at(TASK, again) == Amount(cpu_cores=1.5, memory_mb=600.0)
     demands.learn("merge", again, 2 * EVERY_S + 0.6 + SETTLE_S)
-    assert demands.at(TASK, again) == TASK.demand, "from then on its use is its need"
+    assert demands.at(TASK, again) == Amount(cpu_cores=0.4, memory_mb=250.0), "from then on its use is its need"
 
 
 def test_a_figure_that_was_not_measured_leaves_the_known_one() -> None:
     known = profile(1.5, 600.0)
     for without in (profile(None, None), profile(cpu=None), replace(known, workers=())):
-        assert learnt(known, known, without) == Demand(cpu_cores=1.5, memory_mb=600.0)
+        assert learnt(known, known, without) == Amount(cpu_cores=1.5, memory_mb=600.0)
 
 
 def test_only_another_figure_is_news() -> None:

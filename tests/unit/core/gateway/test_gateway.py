@@ -7,6 +7,7 @@ import pytest
 
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
+from zsched.core.gateway.demand import Amount
 from zsched.core.gateway.gateway import EdgeData, Gateway
 from zsched.core.values.fleet import Demand
 from zsched.core.values.profile import Jobs, Profile, WorkerState
@@ -154,7 +155,7 @@ def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None
     assert gateway.demand(TASK, profile()) == TASK.demand
 
     gateway.learn_demand("merge", "edge1", TTL_S)
-    assert gateway.demand(TASK, profile()) == Demand(cpu_cores=1.5, memory_mb=600.0)
+    assert gateway.demand(TASK, profile()) == Amount(cpu_cores=1.5, memory_mb=600.0)
 
 
 @pytest.mark.parametrize("is_gone", [True, False])

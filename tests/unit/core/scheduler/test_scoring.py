@@ -740,7 +740,8 @@ def test_a_weighed_gauge_is_a_term_like_the_others(form: ScoreForm) -> None:
 
 
 def test_a_node_without_a_gpu_cannot_have_a_task_that_weighs_it_and_one_without_a_battery_counts_as_full() -> None:
-    vector = scored(gauged("edge1", gpu=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.5))
+    spec = replace(SPEC, demand=Demand(gpu=0.1))
+    vector = scored(gauged("edge1", gpu=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.5), spec=spec)
     assert dict(vector.refused)["edge2"] == "gpu: not measured there, and it has a weight"
 
     vector = scored(gauged("edge1", battery=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, battery=0.5))
@@ -833,35 +834,18 @@ def test_a_task_whose_use_of_the_gpu_nobody_knows_does_not_chase_itself(
     pytest.fail(f"it comes back to {owner}")
 
 
-def test_without_its_demand_the_gpu_says_where_a_task_begins_and_where_it_goes_that_must_leave() -> None:
-    agreed, others = weighed(cpu=0.5, gpu=0.5), {"edge2": {"gpu": 0.75}, "edge3": {"gpu": 0.5}}
-    told = (gauged("edge1", gpu=0.875), gauged("edge2", gpu=0.25), gauged("edge3", gpu=0.5))
-    assert terms_of(scored(*told, agreed=replace(agreed, owner=None))) == {"edge1": {"gpu": 0.125}, **others}
-    assert terms_of(scored(*told, agreed=agreed)) == {"edge1": {"gpu": 0.75}, **others}
-    freest = gauged("edge1", gpu=0.0625)
-    assert terms_of(scored(freest, *told[1:], agreed=agreed)) == {"edge1": {"gpu": 0.9375}, **others}
-    assert terms_of(scored(gauged("edge1"), *told[1:], agreed=agreed)) == others, "it must have one"
-    by_file = replace(SPEC, demand=Demand(gpu=0.25))
-    assert terms_of(scored(*told, agreed=agreed, spec=by_file))["edge1"] == {"gpu": 0.125}
-
-
-@pytest.mark.parametrize(
-    ("limit", "gpu", "refused"),
-    [
-        (0.9, {"edge1": 1.0, "edge2": 0.95, "edge3": 0.85}, {"edge2", "edge3"}),
-        (0.9, {"edge2": 0.5}, {"edge1", "edge3"}),
-        (1.0, {"edge1": 1.0, "edge2": 1.0}, {"edge3"}),
-    ],
-)
-def test_without_its_demand_a_limit_of_the_gpu_keeps_a_task_away_and_does_not_drive_it_off(
-    limit: float, gpu: dict[str, float], refused: set[str]
-) -> None:
-    """Else it would leave each machine that it has come to; one without a GPU cannot have it."""
-    spec = replace(SPEC, gauge_limits=(("gpu", limit),))
-    told = [gauged(name, gpu=gpu[name]) if name in gpu else gauged(name) for name in SPEC.candidates]
-    assert {name for name, _ in scored(*told, spec=spec).refused} == refused
-    known = replace(spec, demand=Demand(gpu=0.1))
-    assert ("edge1" in dict(scored(*told, spec=known).refused)) == (limit < gpu.get("edge1", 2.0))
+def test_without_its_demand_the_gpu_s_use_counts_nowhere() -> None:
+    """The task's own use would make each machine look worse that it has come to."""
+    told = (gauged("edge1", gpu=0.875), gauged("edge2", gpu=0.25), gauged("edge3"))
+    agreed = weighed(cpu=0.5, gpu=0.5)
+    assert terms_of(scored(*told, agreed=agreed)) == {"edge1": {}, "edge2": {}, "edge3": {}}
+    limited = replace(SPEC, gauge_limits=(("gpu", 0.6),))
+    assert {name for name, _ in scored(*told, spec=limited).refused} == {"edge3"}, "a limit asks for one"
+    by_file = replace(limited, demand=Demand(gpu=0.25))
+    assert terms_of(scored(*told[:2], agreed=agreed, spec=replace(SPEC, demand=Demand(gpu=0.25))))["edge1"] == {
+        "gpu": 0.125
+    }
+    assert "edge1" in dict(scored(*told, spec=by_file).refused)
 
 
 def test_a_limit_of_the_gpu_tells_what_the_task_would_make_of_it() -> None:
@@ -924,11 +908,3 @@ def test_from_an_owner_far_beyond_its_limit_a_task_goes_inside_the_margin_too(
     assert "edge1" in dict(vector.refused)
     assert ("edge2" in dict(vector.refused)) == is_refused
     assert "edge3" in dict(scored(gauged("edge1", battery=battery), gauged("edge3", battery=0.19), spec=spec).refused)
-
-
-def test_a_gpu_that_may_be_busy_with_the_task_alone_is_never_far_beyond_its_limit() -> None:
-    spec = replace(SPEC, gauge_limits=(("gpu", 0.6),))
-    told = gauged("edge1", gpu=0.9), gauged("edge2", gpu=0.55)
-    assert "edge2" in dict(scored(*told, spec=spec).refused)
-    known = replace(spec, demand=Demand(gpu=0.02))
-    assert "edge2" not in dict(scored(*told, spec=known).refused)
