@@ -558,10 +558,8 @@ _LATER = frozenset(
     {
         ("Weights", "gauges"),
         ("Demand", "gpu"),
-        ("TaskSpec", "gauge_limits"),
-        ("TaskSpec", "rollout"),
-        ("TaskSpec", "cpu_floor_ratio"),
     }
+    | {("TaskSpec", name) for name in ("gauge_limits", "rollout", "cpu_floor_ratio", "prefer", "beside", "priority")}
     | {("Fleet", "cells"), ("NodeSpec", "listen_streams"), ("WorkerSpec", "user")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )
