@@ -23,7 +23,7 @@ from zsched.core.values.fleet import Fleet, electorate_hash, fleet_hash
 from zsched.core.values.messages import FleetQuestion, Refused, fleet_question
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId
 from zsched.core.values.plan import RoutePlan
-from zsched.core.values.profile import DeviceSample
+from zsched.core.values.profile import DeviceSample, WorkerLoad
 from zsched.core.values.struct import replace
 from zsched.core.values.words import Readings
 from zsched.core.vote.generations import blank_state
@@ -43,6 +43,8 @@ Load = Callable[[NodeId, float], tuple[float, float]]
 """(node, time) -> (CPU cores in use, MiB in use), the raw reading of the device profiler."""
 Gauges = Callable[[NodeId, float], Readings]
 """(node, time) -> the raw readings of its gauges."""
+Loads = Callable[[NodeId, float], tuple[WorkerLoad, ...]]
+"""(node, time) -> the raw readings of its workers' use."""
 Cut = Callable[[NodeId, tuple[do.Instruction, ...]], int | None]
 """(node, batch) -> after how many instructions the node crashes; ``None``: it carries out all of them and lives."""
 Make = Callable[[Any], ev.Event]
@@ -64,6 +66,11 @@ def idle(_node: NodeId, _now: float) -> tuple[float, float]:
     return 1.0, 1000.0
 
 
+def unmeasured(_node: NodeId, _now: float) -> tuple[WorkerLoad, ...]:
+    """No machine measures its workers."""
+    return ()
+
+
 def without_gauges(_node: NodeId, _now: float) -> Readings:
     """No machine measures any."""
     return ()
@@ -79,6 +86,7 @@ class Simulator(Links):
     """The generation that the fleet begins with."""
     load: Load = idle
     gauges: Gauges = without_gauges
+    loads: Loads = unmeasured
     cut_batch: Cut | None = None
     broken_disks: set[NodeId] = field(default_factory=set)
     """Nodes that cannot write their state."""
@@ -271,6 +279,7 @@ class Simulator(Links):
             memory_mb=MEMORY_MB,
             memory_used_mb=memory,
             gauges=self.gauges(machine.name, self.now),
+            workers=self.loads(machine.name, self.now),
         )
         self.later(self.fleet.timing.sample_s, self._sample, machine, life)
         self.deliver(machine, ev.ProfileSampled(device=sample))
