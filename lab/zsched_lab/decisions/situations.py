@@ -52,7 +52,8 @@ STANDBY_MB: Final = 50.0
 """What a worker holds that has not got its task."""
 BY: Final = Asked(by="ada@robot1", reason="inspection")
 ASKED: Final = f"""\
-Where will {{}} be {AFTER_S:g} s after the second screen? If it moves, how soon after that screen:
+From the second screen on nothing changes but by what zsched does: loads, workers, links and orders stay as they are.
+Where will {{}} be {AFTER_S:g} s after that screen? If it moves, how soon after that screen:
 within {BANDS[0]:g} s, {BANDS[0]:g} to {BANDS[1]:g} s, or {BANDS[1]:g} to {BANDS[2]:g} s?"""
 TASK: Final = """\
   NAME:
@@ -94,8 +95,12 @@ class Hall:
         self.sim.start()
 
     def _at_work(self, node: NodeId) -> list[TaskId]:
-        roles = self.sim.machines[node].roles
-        return [one for one in roles if roles[one].role is WorkerRole.ACTIVE and (node, one) not in self.hung]
+        found = []
+        for name, role in self.sim.machines[node].roles.items():
+            has_lease = role.lease_until_s is None or self.sim.now < role.lease_until_s
+            is_at_work = role.role is WorkerRole.ACTIVE and has_lease and (node, name) not in self.hung
+            found += [name] if is_at_work else []
+        return found
 
     def _others_cores(self, node: NodeId) -> float:
         helpers = self.beside.get(node, 0.0) if self._at_work(node) else 0.0

@@ -61,7 +61,7 @@ def test_the_answers_are_printed_only_where_they_are_asked_for(
     monkeypatch.setattr("zsched_lab.decisions.situations.SITUATIONS", SITUATIONS[:1])
     assert main([]) == 0
     asked = capsys.readouterr().out
-    assert "Where will map be 10 s after" in asked
+    assert "Where will map be 10 s after that screen?" in asked
     assert "ANSWER" not in asked
     assert SITUATIONS[0].name not in asked
     assert main(["--answers"]) == 0
