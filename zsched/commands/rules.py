@@ -24,11 +24,7 @@ def told_once(specs: Iterable[TaskSpec], timing: Timing) -> list[list[str]]:
     alike: dict[tuple[str, ...], list[str]] = {}
     for spec in specs:
         alike.setdefault(tuple(told(spec, timing)), []).append(spec.name)
-    return [[f"{_named(names)}: {first}", *more] for (first, *more), names in alike.items()]
-
-
-def _named(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"tasks {', '.join(names)}"
+    return [[f"{'tasks ' * (len(of) > 1)}{', '.join(of)}: {first}", *more] for (first, *more), of in alike.items()]
 
 
 def told(spec: TaskSpec, timing: Timing) -> list[str]:
@@ -72,6 +68,7 @@ def _limits(spec: TaskSpec) -> Iterator[str]:
     for name, limit in spec.gauge_limits:
         gauge = BY_NAME[name]
         yield f"{gauge.says} is {'below' if gauge.is_floor else 'above'} {gauge.shown(limit)} (limits.{name})"
+    yield f"its worker is not ready, the owner's for {spec.worker.start_deadline_s:g} s (start_deadline_s)"
     yield f"{'a robot' if spec.reach is Reach.ALL else 'half of the robots'} cannot reach it (reach)"
     low = spec.limits.nu_dbm
     yield f"the signal is below {low:g} dBm (link.nu_dbm), or {low + REACH_MARGIN_DB:g} while its own one is reached"

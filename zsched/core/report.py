@@ -50,7 +50,7 @@ _Maker: TypeAlias = Callable[[Any], Any]
 _ATOMS: Final = frozenset({str, int, float, bool, type(None)})
 _OWN_FIELDS: Final[Mapping[type, Mapping[str, _Maker]]] = {
     Snapshot: {"counters": dict, "dropped_ages": dict},
-    DecisionStatus: {"aggregates": dict, "utilities": _columns, "vetoed": dict, "unkept": dict},
+    DecisionStatus: {"aggregates": dict, "utilities": _columns, "vetoed": dict, "unkept": dict, "owed": dict},
     VoteStatus: {"votes": dict},
     StreamCount: {"drops": dict},
 }

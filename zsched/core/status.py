@@ -719,6 +719,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
         utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
         vetoed=tuple((name, veto.why) for name, veto in sorted(joint.vetoed.items())),
         unkept=tuple(sorted(standing.judge.kept.unkept(joint.aggregates, standing.judge.spec.memory_s, now).items())),
+        owed=tuple(sorted(judgement.owed.items())),
         silent=standing.silent,
     )
 

@@ -49,7 +49,7 @@ def test_every_setting_that_differs_from_its_default_is_named_with_its_key() -> 
         (replace(SPEC, beside=(("plan", 0.2), ("watch", -0.3))), "0.2 more beside plan (together)"),
         (replace(SPEC, beside=(("plan", 0.2), ("watch", -0.3))), "0.3 less beside watch (spread)"),
         (replace(SPEC, priority=2), "tasks below 2 use counts as free (priority)"),
-        (replace(SPEC, reach=Reach.ALL), "not where a robot cannot reach it (reach)"),
+        (replace(SPEC, reach=Reach.ALL), "; a robot cannot reach it (reach)"),
     ],
 )
 def test_a_setting_is_told_by_what_it_does(spec: TaskSpec, said: str) -> None:

@@ -164,14 +164,16 @@ def _bars(task: Json, points: Sequence[Point], frame: Frame) -> list[str]:
     best = sorted(task["candidates"], key=lambda name: (name != task["owner"], -newest.get(name, -1.0)))
     names = [name for name in task["candidates"] if name in best[:MOST_CANDIDATES]]
     room = name_room(frame.width, 6, *(len(name) + 1 for name in names))
-    held = _held(points, frame.width - room - 9, frame)
-    vetoed = {} if task["decision"] is None else task["decision"]["vetoed"]
+    held = _held(points, frame.width - room - 22, frame)
+    decision = task["decision"] or {}
+    vetoed, owed = decision.get("vetoed", {}), decision.get("owed", {})
     for name in names:
         is_owner = name == task["owner"]
         text = short_name(name, room - is_owner) + "*" * is_owner
         label = page.paint(text.ljust(room), "bold" if is_owner else "")
         if name in newest:
-            page.lines.append(f" {label} {newest[name]:.3f}  {_bar(held, name, page)}")
+            owes = f"owes {max(owed[name], 0.0):.2f} s" if name in owed else ""  # an older daemon does not tell
+            page.lines.append(f" {label} {newest[name]:.3f}  {owes:11}  {_bar(held, name, page)}")
         else:
             page.row((" " * (room + 1), room + 1, ""), ("-", 5, ""), (vetoed.get(name, "no utility"), 99, "yellow"))
             page.lines[-1] = f" {label}{page.lines[-1][room + 1 :]}"

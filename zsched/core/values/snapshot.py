@@ -89,6 +89,8 @@ class DecisionStatus(Struct, frozen=True, kw_only=True):
     vetoed: tuple[tuple[NodeId, str], ...] = ()
     unkept: tuple[tuple[NodeId, float], ...] = ()
     """What is taken off machines that promised as much before, and did not give it, or failed."""
+    owed: tuple[tuple[NodeId, float], ...] = ()
+    """Seconds of work that the task owes where it may be, with what it will lose (`zsched.core.scheduler.ledger`)."""
     silent: tuple[NodeId, ...] = ()
     """Robots whose utilities did not come in time."""
 
