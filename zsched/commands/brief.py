@@ -93,7 +93,9 @@ def _cells(task: Json, at: float | None, task_room: int, owner_room: int) -> lis
 
 def _marks(task: Json) -> str:
     """What an operator has ordered, in a word each; both are later fields of the schema's major version."""
-    return "".join(f" ({word})" for key, word in (("pin", "pin"), ("rollout", "rollout")) if task.get(key) is not None)
+    pin = task.get("pin")
+    where = "" if pin is None or pin["node"] in (None, task["owner"]) else f" {pin['node']}"
+    return f"{'' if pin is None else f' (pin{where})'}{' (rollout)' if task.get('rollout') else ''}"
 
 
 def _flow(task: Json, way: str) -> str:

@@ -463,7 +463,7 @@ def _sum(page: Page, body: Json, one: Json, indent: int) -> None:
     if one["total"] is not None:
         text += f" = {one['total']:.4f}"
     if one.get("owed_s") is not None:
-        text += f"; owes {max(one['owed_s'], 0.0):.2f} s"
+        text += f"; owes {one['owed_s']:.2f} s"
     if one["why_not"]:
         text, style = f"{text}; {one['why_not']}" if text else one["why_not"], "red"
     tail = f" (needs {need})" if need else " (owner)" if one["is_owner"] else ""

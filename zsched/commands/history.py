@@ -264,11 +264,8 @@ def when_of(entry: Json, now: float) -> Json:
 
 
 def is_known(move: Json) -> bool:
-    """Whether no owner changed: the daemon had begun anew, and found the task where it was.
-
-    A line that an older daemon has written says so by its reason alone.
-    """
-    return bool(move.get("is_known")) or (move["left"] is None and str(move["reason"]).startswith("known from"))
+    """Whether no owner changed: the daemon had begun anew, and found the task where it was."""
+    return bool(move.get("is_known"))
 
 
 def where_of(move: Json) -> str:

@@ -75,6 +75,8 @@ class PastValue(Struct, frozen=True, kw_only=True):
     value: Allocation
     at: float
     reason: str
+    is_known: bool
+    """It was there before this node knew of it."""
 
 
 UNREADY_SHOWN_S = 2.0

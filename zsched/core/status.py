@@ -456,6 +456,7 @@ def _task_status(node: Stages, spec: TaskSpec, now: float) -> TaskStatus:
                 age_s=now - past.at,
                 reason=past.reason,
                 by="" if past.value.asked is None else past.value.asked.by,
+                is_known=past.is_known,
             )
             for past in node.history[spec.name]
         ),

@@ -140,7 +140,7 @@ def test_a_long_event_goes_on_in_its_next_line_on_a_terminal(pages: Pages, capsy
 
 
 def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
-    older = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart"}
+    older = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart", "is_known": True}
     known = {**older, "reason": "as it was", "is_known": True}
     pages.entries = [
         entry("learnt", 60.0, move={**older, "owner": None}),

@@ -281,7 +281,7 @@ def test_a_pin_names_its_node_and_says_when_it_is_hard(daemon: Daemon) -> None:
     assert run("pin").stdout.startswith("echo: edge2 (hard), ")
     told_by = daemon.status["tasks"][0]["pin"]["by"]
     shown = [render(daemon.status, 100, color=False) for render in (render_brief, render_status)]
-    assert "edge1 (pin)" in shown[0]
+    assert "edge1 (pin edge2)" in shown[0]
     assert [f"pinned to edge2 (hard), {told_by}" in " ".join(text.split()) for text in shown] == [True, True]
     assert run("pin", "echo", "egde2").exit_code == 2
 

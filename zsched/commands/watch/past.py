@@ -103,7 +103,7 @@ def _remembered(task: Json, at: float) -> Iterator[Json]:
             "revision": past["revision"],
             "from": left,
             "to": past["owner"],
-            "is_known": number == 0 and (past["epoch"] % CREATION_STEP > 1 or past["reason"].startswith("known from")),
+            "is_known": number == 0 and (past["epoch"] % CREATION_STEP > 1 or past.get("is_known", False)),
             "reason": past["reason"],
             "votes": {},
             "switched_s": None,

@@ -172,7 +172,7 @@ def _bars(task: Json, points: Sequence[Point], frame: Frame) -> list[str]:
         text = short_name(name, room - is_owner) + "*" * is_owner
         label = page.paint(text.ljust(room), "bold" if is_owner else "")
         if name in newest:
-            owes = f"owes {max(owed[name], 0.0):.2f} s" if name in owed else ""  # an older daemon does not tell
+            owes = f"owes {owed[name]:.2f} s" if name in owed else ""  # an older daemon does not tell
             page.lines.append(f" {label} {newest[name]:.3f}  {owes:11}  {_bar(held, name, page)}")
         else:
             page.row((" " * (room + 1), room + 1, ""), ("-", 5, ""), (vetoed.get(name, "no utility"), 99, "yellow"))

@@ -45,7 +45,7 @@ def carry_out(node: Stages, value: Allocation, why: Why, todo: ToDo, now: float,
     is_by_order = value.asked is not None and (is_ours or _has_only_moved(node, value))
     move = _move_of(node, value, why, is_known=is_known) if is_new_epoch and value.owner is not None else None
     reason = _reason_of(node, value, why, is_new_epoch=is_new_epoch) if move is None else move.reason
-    node.history[task].append(PastValue(value=value, at=now, reason=reason))
+    node.history[task].append(PastValue(value=value, at=now, reason=reason, is_known=is_known))
     if is_new_epoch:
         left = executor.owner
         failed, drained = _has_failed(node, value, left, now, is_ours=is_ours), node.was_draining(left, now)

@@ -145,6 +145,8 @@ class PastAllocation(Struct, frozen=True, kw_only=True):
     reason: str
     by: str = ""
     """The operator who ordered it, user@node; empty: the fleet decided it."""
+    is_known: bool = False
+    """It was there before this node knew of it."""
 
 
 class TaskStatus(Struct, frozen=True, kw_only=True):
