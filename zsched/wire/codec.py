@@ -288,16 +288,16 @@ def _fixed_codec(args: tuple[Any, ...]) -> tuple[Reader, Writer]:
 def _dataclass_codec(cls: type) -> tuple[Reader, Writer]:
     hints = hints_of(cls)
     cls = get_origin(cls) or cls
-    read, write = _Source(cls=cls, fail=_fail, WireError=WireError, ABSENT=MISSING), _Source()
+    read, write = _Source(cls=cls, fail=_fail, WireError=WireError), _Source()
     read.lines = ["def f(value):", " if type(value) is not dict:"]
-    read.lines += [f"  raise fail('expected a map ({cls.__name__})', value)", " get = value.get"]
+    read.lines += [f"  raise fail('expected a map ({cls.__name__})', value)"]
     write.lines = ["def f(value):", " body = {}"]
     arguments = []
     for index, field in enumerate(fields(cls)):
         name, hint, item, default = field.name, hints[field.name], f"item{index}", f"default{index}"
         read.names[default] = write.names[default] = field.default
         arguments.append(f"{name}={item}")
-        read.lines += [f" {item} = get({name!r}, ABSENT)", f" if {item} is not ABSENT:"]
+        read.lines += [f" if {name!r} in value:", f"  {item} = value[{name!r}]"]
         read.lines += [f"  {item} = {read.reading(hint, item)}", " else:"]
         write.lines += [f" {item} = value.{name}"]
         if field.default is MISSING:
