@@ -508,10 +508,7 @@ class Fleet:
 
     def task(self, name: TaskId) -> TaskSpec:
         """The task called ``name``. Raises `KeyError` when the fleet has none."""
-        for task in self.tasks:
-            if task.name == name:
-                return task
-        raise KeyError(name)
+        return {task.name: task for task in self.tasks}[name]
 
 
 @lru_cache(maxsize=8)

@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from enum import StrEnum
+from functools import lru_cache
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from zsched.core.values.struct import Struct, replace
@@ -48,9 +49,12 @@ def check_length(field: str, text: str, longest: int = MAX_REASON) -> None:
         raise ValueError(f"{field}: {len(text)} characters, at most {longest}")
 
 
+_match = lru_cache(maxsize=1024)(NAME.fullmatch)
+
+
 def check_name(field: str, value: str) -> None:
     """Raise `ValueError` unless ``value`` is a valid node, task or fleet name."""
-    if NAME.fullmatch(value) is None:
+    if _match(value) is None:
         raise ValueError(f"{field}: {value!r} is not a name ({A_NAME})")
 
 
@@ -268,11 +272,12 @@ class Utility(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         check_name("utility.candidate", self.candidate)
-        check_range("utility.value", self.value, 0.0, 1.0)
-        check_range("utility.cpu", self.cpu, 0.0, 1.0)
-        check_range("utility.memory", self.memory, 0.0, 1.0)
-        check_range("utility.network", self.network, 0.0, 1.0)
-        check_readings("utility.gauges", self.gauges, 0.0, 1.0)
+        for share in (self.value, self.cpu, self.memory, self.network):
+            if share is not None and not 0.0 <= share <= 1.0:
+                for field in ("value", *PAPER_METRICS):
+                    check_range(f"utility.{field}", getattr(self, field), 0.0, 1.0)
+        if self.gauges:
+            check_readings("utility.gauges", self.gauges, 0.0, 1.0)
 
     @property
     def terms(self) -> dict[str, float | None]:
