@@ -8,10 +8,11 @@ from __future__ import annotations
 import pytest
 
 from support.allocations import allocation_of
+from support.equations import total_utility
 from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.standing import Standing, compare, pick
-from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use, total_utility
+from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use
 from zsched.core.values.fleet import LinkLimits
 from zsched.core.values.model import Aggregate, Reach, Tuning, Weights
 

@@ -929,8 +929,8 @@ VOTE_BUGS = (
     _bug(
         "who beats is reached by streams",
         SCORING,
-        "(not is_there or candidate in doubts.unseen):",
-        "not is_there:",
+        "(not is_there or candidate in doubts.unseen) and",
+        "not is_there and",
         _SCHEDULER,
     ),
     _bug(
@@ -957,8 +957,8 @@ VOTE_BUGS = (
     _bug(
         "a candidate gains by a far robot that leaves it out",
         STANDING,
-        "return whole if len(whole) >= majority(len(vectors)) else vectors",
-        "return vectors",
+        "return whole if len(whole) >= majority(len(rows)) else rows",
+        "return rows",
         ("tests/unit/core/scheduler/test_compare.py",),
     ),
     _bug(
@@ -1153,8 +1153,8 @@ VOTE_BUGS = (
     _bug(
         "a task's own thread takes from its share where it runs",
         "zsched.core.gateway.sharing",
-        "max(profile.runnable - own + coming_cores, 0.0))",
-        "max(profile.runnable + coming_cores, 0.0))",
+        "max(profile.runnable - own + coming_cores, 0.0)\n",
+        "max(profile.runnable + coming_cores, 0.0)\n",
         ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
@@ -1167,8 +1167,8 @@ VOTE_BUGS = (
     _bug(
         "what comes is taken off the share of an owner that is short",
         SCORING,
-        "least_cores=min(fair, own.cpu_cores) if is_measured else fair",
-        "least_cores=0.0 if is_measured else fair",
+        "least=min(fair, own), most",
+        "least=0.0, most",
         ("tests/unit/core/scheduler/test_bookings.py", "tests/unit/core/test_closed_loop_tasks.py"),
     ),
     _bug(
@@ -1399,8 +1399,8 @@ VOTE_BUGS = (
     _bug(
         "where nobody measures what is weighed nobody gets the task",
         SCORING,
-        "        if are_alike:\n            value = 1.0\n        elif",
-        "        if",
+        "value = 1.0 if are_alike else total",
+        "value = total",
         ("tests/unit/core/scheduler/test_scoring.py",),
     ),
     _bug(

@@ -15,6 +15,7 @@ import pytest
 
 from support.allocations import allocation_of
 from support.decisions import figures_of
+from support.equations import total_utility
 from support.fleets import task_of, tuning_of
 from support.schemas import faults
 from zsched.adapters.host.decision_log import NAME, DecisionLog
@@ -24,7 +25,6 @@ from zsched.commands.common import CliError
 from zsched.commands.explain import SCHEMA, ExplainView, explain, formula_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
-from zsched.core.scheduler.utility import total_utility
 from zsched.core.values.decision import Decision, Explanation, JudgeMemory, KeptMemory, Move, Need
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights

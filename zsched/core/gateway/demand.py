@@ -57,6 +57,9 @@ class _Known(Struct, frozen=True):
     """When the owner's machine last had no CPU to spare."""
 
 
+_NOTHING: Final = _Known()
+
+
 class Amount(Struct, frozen=True):
     """CPU and memory that are used, needed or coming."""
 
@@ -90,7 +93,7 @@ class Demands:
             fastest: the highest speed among the candidates (``None``: the owner's).
         """
         load = profile.worker(task)
-        known = self._known.get(task, _Known())
+        known = self._known.get(task, _NOTHING)
         if load is not None and load.state is not WorkerState.READY and known.owner == profile.node:
             # once it is ready its use rises from nothing, as after a move
             self._known[task] = replace(known, owner=None)
@@ -123,7 +126,7 @@ class Demands:
 
         1 where nothing shows that it lacks anything, and where its use still rises.
         """
-        load, work = self._settled(task, profile, now), self._known.get(task, _Known()).work
+        load, work = self._settled(task, profile, now), self._known.get(task, _NOTHING).work
         if not work or load is None or load.cpu_cores is None or not (shows_lack(load) and is_short(load)):
             return 1.0
         return min(load.cpu_cores * speed_of(profile) / work, 1.0)
@@ -140,12 +143,12 @@ class Demands:
 
     def _settled(self, task: TaskId, profile: Profile, now: float) -> WorkerLoad | None:
         """The task's worker where its use has risen since it came; ``None``: elsewhere, or it still rises."""
-        known = self._known.get(task, _Known())
+        known = self._known.get(task, _NOTHING)
         return profile.worker(task) if known.owner == profile.node and now - known.since >= SETTLE_S else None
 
     def note_unplaced(self, task: TaskId) -> None:
         """Nobody has the task: who gets it next will not show it at once."""
-        known = self._known.get(task, _Known())
+        known = self._known.get(task, _NOTHING)
         self._known[task] = replace(known, owner=None, is_unplaced=True)
 
     def forget(self, task: TaskId) -> None:
@@ -162,27 +165,27 @@ class Demands:
 
     def is_replaced(self, task: TaskId, profile: Profile) -> bool:
         """Whether the owner's worker was seen to run by the recipe before, and now is ready by the changed one."""
-        known, load = self._known.get(task, _Known()), profile.worker(task)
+        known, load = self._known.get(task, _NOTHING), profile.worker(task)
         is_ready = load is not None and load.state is WorkerState.READY and load.renewal is Renewal.NONE
         return is_ready and known.is_changed and known.is_job_old
 
     def job(self, task: TaskId) -> JobNeed | None:
         """One job's need; ``None``: its worker has never reported any."""
-        return self._known.get(task, _Known()).job
+        return self._known.get(task, _NOTHING).job
 
     def unshown_ratio(self, task: TaskId, node: NodeId, now: float, shows_s: float = SHOWS_S) -> float:
         """The part of a task's use that a node's figures, means over about ``shows_s``, do not show yet, in [0, 1].
 
         All of it until the task is seen there, if it was seen elsewhere before; then less with every second.
         """
-        known = self._known.get(task, _Known())
+        known = self._known.get(task, _NOTHING)
         if known.owner != node:
             return 1.0 if known.is_unplaced or known.seen_at not in (None, node) else 0.0
         return math.exp((known.since - now) / shows_s) if known.has_come else 0.0
 
     def holds_all(self, task: TaskId, node: NodeId, now: float) -> bool:
         """Whether the task's worker there has had it for so long that it holds the memory that it works with."""
-        known = self._known.get(task, _Known())
+        known = self._known.get(task, _NOTHING)
         return known.owner == node and now - known.since >= HOLDS_ALL_S
 
     def at(self, spec: TaskSpec, profile: Profile) -> Need:

@@ -37,7 +37,8 @@ class Gateway:
         """{node: the last readings in this life of its gauges without which it may have a task}."""
         self.demands = Demands()
         """What tasks need, as this node has learnt it."""
-        self._shares = Shares()
+        self.shares = Shares()
+        """What they would get of full machines."""
         self.version = 0
         """Rises with every change; a result from an older version may be wrong."""
         self.adopt(fleet)
@@ -50,7 +51,7 @@ class Gateway:
         for known in (self._profiles, self._tracks, self._readings):
             for name in [name for name in known if name not in self._names]:
                 del known[name]
-        self._shares.keep(self._names)
+        self.shares.keep(self._names)
         self.version += 1
 
     def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
@@ -109,22 +110,22 @@ class Gateway:
         fastest = max((speed_of(one) for one in heard_now if one is not None), default=None)
         if self.demands.is_replaced(task, profile):
             self.forget(task)
-        has_share = self._shares.learn(task, profile, now)
+        has_share = self.shares.learn(task, profile, now)
         load = profile.worker(task)
         if load is None or load.cpu_cores is None:  # nobody measures it
             for one in (self.fresh(name, now) for name in candidates if name != owner):
                 if one is not None:
-                    self._shares.look_elsewhere(task, one, now)
-        for name in self._shares.left_by(task, owner):
+                    self.shares.look_elsewhere(task, one, now)
+        for name in self.shares.left_by(task, owner):
             left = self.fresh(name, now)
-            has_share |= left is not None and self._shares.look_back(task, left, now)
+            has_share |= left is not None and self.shares.look_back(task, left, now)
         has_need = self.demands.learn(task, profile, now, fastest)
         self.version += has_need or has_share
 
     def forget(self, task: TaskId) -> None:
         """Know no need and no share of a task that is no more."""
         self.demands.forget(task)
-        self._shares.forget(task)
+        self.shares.forget(task)
         self.version += 1
 
     def expect_another(self, task: TaskId) -> None:
@@ -135,11 +136,3 @@ class Gateway:
     def demand(self, spec: TaskSpec, profile: Profile) -> Need:
         """The task's demand on the node of ``profile``."""
         return self.demands.at(spec, profile)
-
-    def beside_unmeasured(self, spec: TaskSpec, profile: Profile, need_cores: float) -> tuple[float, float] | None:
-        """(its threads, others') where a worker is at work that nobody measures (`zsched.core.gateway.sharing`)."""
-        return self._shares.beside_unmeasured(spec.name, profile, need_cores)
-
-    def share(self, spec: TaskSpec, profile: Profile, need_cores: float, coming_cores: float) -> float:
-        """Cores that the task would get on the node of ``profile``, were it full (`zsched.core.gateway.sharing`)."""
-        return self._shares.at(spec.name, profile, need_cores, coming_cores)

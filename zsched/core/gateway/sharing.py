@@ -192,12 +192,13 @@ class Shares:
         if profile.runnable is None:
             return 0.0
         cores = profile.cpu_cores
-        got = self._got.get((task, profile.node))
-        if got is None or got.machine_cores != cores:
-            got = _Got(self._threads.get(task, max(need_cores, 1.0)), 1.0, cores)
         load = profile.worker(task)
         own = 0.0 if load is None else threads_of(load)
-        return got.kept * fair_share(cores, got.threads, max(profile.runnable - own + coming_cores, 0.0))
+        others = max(profile.runnable - own + coming_cores, 0.0)
+        got = self._got.get((task, profile.node))
+        if got is None or got.machine_cores != cores:
+            return fair_share(cores, self._threads.get(task) or max(need_cores, 1.0), others)
+        return got.kept * fair_share(cores, got.threads, others)
 
 
 def _is_hungry(load: WorkerLoad) -> bool:

@@ -6,7 +6,7 @@ node is worth (`zsched.core.scheduler.scoring`), who reaches it, what others say
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Final
 
@@ -56,8 +56,9 @@ def may_get(spec: TaskSpec, state: WorkerState | None) -> bool:
     """
     if state is None:
         return not spec.worker.command
-    starts_then = bool(spec.worker.command) and spec.worker.standby is Standby.COLD
-    return state is WorkerState.READY or (starts_then and state is not WorkerState.FAILED)
+    if state is WorkerState.READY:
+        return True
+    return bool(spec.worker.command) and spec.worker.standby is Standby.COLD and state is not WorkerState.FAILED
 
 
 class Doubts(Struct, frozen=True, kw_only=True):
@@ -121,20 +122,20 @@ def _streams(case: Case) -> str:
 def _worker(case: Case) -> str:
     """Why its worker cannot do the task."""
     load = None if case.profile is None else case.profile.worker(case.spec.name)
-    state = None if load is None else load.state
-    if case.spec.worker.command and state is None:
-        return "runs no worker for it"
-    why = "" if load is None or not load.reason else f": {load.reason}"
-    if state is WorkerState.FAILED:
-        return f"worker failed{why}"
-    return "" if case.is_owner or may_get(case.spec, state) else f"worker {state}{why}"
+    if load is None:
+        return "runs no worker for it" if case.spec.worker.command else ""
+    if may_get(case.spec, load.state):
+        return ""
+    why = f"worker {load.state}{': ' if load.reason else ''}{load.reason}"
+    return "" if case.is_owner and load.state is not WorkerState.FAILED else why
 
 
 def _memory(case: Case) -> str:
     return "" if case.profile is None else lacks_memory(case.profile, case.needed_mb, case.use)
 
 
-CHAIN: dict[Filter, Callable[[Case], str]] = {
+Check = Callable[[Case], str]
+CHAIN: dict[Filter, Check] = {
     Filter.HEARD: _heard,
     Filter.LEASE: _lease,
     Filter.TERMS: lambda case: _lease(case, Filter.TERMS),
@@ -151,9 +152,19 @@ CHAIN: dict[Filter, Callable[[Case], str]] = {
 """What one robot looks at by itself, in order: {filter: why it keeps the candidate out, or nothing}."""
 
 
-def veto(case: Case) -> Veto | None:
+def chain_of(spec: TaskSpec, doubts: Doubts) -> list[tuple[Filter, Check]]:
+    """`CHAIN` without the filters that keep out no node of these, whatever its profile."""
+    idle = [
+        *(() if doubts.unfit else (Filter.LEASE, Filter.TERMS)),
+        *(() if doubts.unproven else (Filter.STREAMS,)),
+        *(() if spec.gauge_limits else (Filter.LIMIT, Filter.MARGIN)),
+    ]
+    return [(name, check) for name, check in CHAIN.items() if name not in idle]
+
+
+def veto(case: Case, chain: Iterable[tuple[Filter, Check]]) -> Veto | None:
     """Why the node may not have the task; ``None``: it may, as far as one robot sees."""
-    for name, check in CHAIN.items():
+    for name, check in chain:
         if why := check(case):
             return Veto(name, why)
     return None
@@ -189,7 +200,7 @@ def _limits(spec: TaskSpec) -> Iterator[tuple[GaugeName, float]]:
 
 def _beyond_limits(case: Case, *, has_margin: bool) -> str:
     """Why the machine's gauges forbid the task; empty: they do not."""
-    if not case.spec.gauge_limits or case.profile is None:
+    if case.profile is None:
         return ""
     spec, told = case.spec, dict(possible(case.profile.gauges))
     faults = (

@@ -228,7 +228,7 @@ class Judge:
 
     def _charge(self, worth: Mapping[NodeId, float], owner: NodeId | None, now: float) -> dict[NodeId, float]:
         """Charge everybody; {machine: what it owes, with what it will lose}. One without a worth loses all."""
-        names = {*self.spec.candidates, *worth, *(() if owner is None else (owner,))}
+        names = dict.fromkeys((*self.spec.candidates, *worth, *(() if owner is None else (owner,))))
         losses = {name: 1.0 - worth.get(name, 0.0) for name in sorted(names)}
         self.ledger.charge(losses, owner, price_s=self.spec.price_s, memory_s=self.spec.memory_s, now=now)
         return self.ledger.expected(losses)

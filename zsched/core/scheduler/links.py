@@ -21,6 +21,9 @@ from zsched.core.values.struct import Struct
 WIRED_DBM = 0.0
 """Stands for a cable in comparisons of signals: better than any radio."""
 
+Signals = Mapping[NodeId | None, float | None]
+"""{peer (``None``: the access point or the cable): the smoothed signal in dBm}; ``None``: not measured."""
+
 
 class PairLink(Struct, frozen=True):
     """The link of one (robot, candidate) pair: ``is_reached`` by nu, and Eq. 3's kappa in [0, 1]."""
@@ -36,13 +39,12 @@ class PairLink(Struct, frozen=True):
 def pair_link(
     voter: NodeId,
     candidate: NodeId,
-    gateway: Gateway,
+    signals: tuple[Signals, Signals],
     limits: LinkLimits,
-    now: float,
     margin_db: float = 0.0,
     own_margin_db: float = 0.0,
 ) -> PairLink | None:
-    """Eq. 3 for one (robot, candidate) pair, or ``None`` when nobody measured it.
+    """Eq. 3 for one (robot, candidate) pair with these ``signals`` at its two ends; ``None``: nobody measured it.
 
     A candidate is at its limit up to ``margin_db`` above nu, the access point by the robot's own radio up to
     ``own_margin_db`` above it.
@@ -52,45 +54,25 @@ def pair_link(
     """
     if voter == candidate:
         return PairLink(is_reached=True, utility=1.0)
-    ends, nu_dbm = (gateway.fresh(voter, now), gateway.fresh(candidate, now)), limits.nu_dbm
-    for end, other in ((ends[0], candidate), (ends[1], voter)):
-        signal_dbm = None if end is None else _way(end, other)
-        if signal_dbm is not None:
-            return PairLink(
-                is_reached=signal_dbm >= nu_dbm,
-                utility=_worth(signal_dbm, limits),
-                at_limit=nu_dbm <= signal_dbm < nu_dbm + margin_db,
-            )
-    if ends[0] is None or ends[1] is None:
+    (own, its), nu_dbm = signals, limits.nu_dbm
+    own_dbm = its_dbm = its.get(voter) if own.get(candidate) is None else own[candidate]
+    if is_direct := own_dbm is not None:
+        own_margin_db = margin_db
+    else:
+        own_dbm, its_dbm = own.get(None), its.get(None)
+    if own_dbm is None or its_dbm is None:
         return None
-    own, its = _way(ends[0], None), _way(ends[1], None)
-    if own is None or its is None:
-        return None
-    is_reached = min(own, its) >= nu_dbm
-    is_clear = own >= nu_dbm + own_margin_db and its >= nu_dbm + margin_db
-    at_limit = is_reached and not is_clear
-    return PairLink(is_reached=is_reached, utility=_joint(own, its, limits), at_limit=at_limit, is_direct=False)
+    is_reached = own_dbm >= nu_dbm and its_dbm >= nu_dbm
+    is_clear = own_dbm >= nu_dbm + own_margin_db and its_dbm >= nu_dbm + margin_db
+    signal_dbm = its_dbm if limits.pair is PairReading.CANDIDATE else min(own_dbm, its_dbm)
+    utility = network_utility(signal_dbm, nu_dbm, limits.rho_dbm)
+    return PairLink(is_reached, utility, is_reached and not is_clear, is_direct)
 
 
-def _joint(own_dbm: float, its_dbm: float, limits: LinkLimits) -> float:
-    """Two ways through one access point as one utility, by the task's reading of a pair."""
-    is_candidates = limits.pair is PairReading.CANDIDATE
-    return _worth(its_dbm if is_candidates else min(own_dbm, its_dbm), limits)
-
-
-def _worth(signal_dbm: float, limits: LinkLimits) -> float:
-    return network_utility(signal_dbm, limits.nu_dbm, limits.rho_dbm)
-
-
-def _way(profile: Profile, peer: NodeId | None) -> float | None:
-    """The smoothed signal of a node's link to ``peer`` (``None``: to the access point or the cable), in dBm.
-
-    ``None``: it measures none.
-    """
-    for link in profile.links:
-        if link.peer == peer:
-            return WIRED_DBM if link.source is LinkSource.WIRED else link.rssi_dbm
-    return None
+def signals_of(profile: Profile | None) -> Signals:
+    """A node's links by its fresh profile; of several to one peer the first."""
+    links = () if profile is None else profile.links
+    return {one.peer: WIRED_DBM if one.source is LinkSource.WIRED else one.rssi_dbm for one in reversed(links)}
 
 
 def ways(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
@@ -21,6 +21,7 @@ LOST_S = 3.0
 RESOLUTION = 1 / 1024
 """Aggregates are compared to this: half of what a tenth of a machine's free share is worth."""
 
+_Row = Mapping[NodeId, Utility]
 _UNSCORED = Veto(Filter.SCORES, "not scored by enough robots")
 
 
@@ -72,23 +73,22 @@ def compare(
             its signal is no better place: it would be lost as soon.
     """
     told = _counted(allocation, vectors)
-    needed = _needed(spec, told)
+    needed, least = _needed(spec, told), majority(len(told))
     fresh = told
     if allocation.owner is not None and (lost_for_s < LOST_S or reaches_owner(spec, allocation, vectors)):
         fresh = tuple(_with_margin(vector) for vector in told)
-    columns: dict[NodeId, list[Utility]] = {candidate: [] for candidate in spec.candidates}
+    # each candidate once, however often a vector names it
+    rows = [{utility.candidate: utility for utility in vector.utilities} for vector in fresh]
     reasons: dict[NodeId, Veto] = {}
     for vector in fresh:
-        for candidate, utility in {utility.candidate: utility for utility in vector.utilities}.items():
-            columns.setdefault(candidate, []).append(utility)  # once per voter, however often its vector names it
         reasons |= vector.vetoes
     mean = mean_of(allocation.tuning.aggregate)
     vetoed: dict[NodeId, Veto] = {}
     kept: list[NodeId] = []
     for candidate in spec.candidates:
-        column = columns[candidate]
-        reaching = sum(utility.reachable for utility in column)
-        if len(column) < majority(len(fresh)) or len(column) == reaching < needed:
+        column = [row[candidate].reachable for row in rows if candidate in row]
+        reaching = sum(column)
+        if len(column) < least or len(column) == reaching < needed:
             # Not scored is not "not reached": only the latter is a reason to flee from an owner.
             vetoed[candidate] = reasons.get(candidate, _UNSCORED)
         elif reaching < needed:
@@ -99,7 +99,7 @@ def compare(
         else:
             kept.append(candidate)
     return Standing(
-        aggregates=_aggregates(kept, fresh, mean),
+        aggregates=_aggregates(kept, rows, mean),
         vetoed=vetoed,
         vectors=fresh,
         voters_heard=len(fresh),
@@ -127,29 +127,31 @@ def _with_margin(vector: UtilityVector) -> UtilityVector:
 
 def mean_of(aggregate: Aggregate) -> Callable[[list[float]], float]:
     """How robots' utilities become one."""
-    return statistics.fmean if aggregate is Aggregate.MEAN else statistics.median
+    return (lambda one: math.fsum(one) / len(one)) if aggregate is Aggregate.MEAN else statistics.median
 
 
-def counted(candidates: Iterable[NodeId], vectors: tuple[UtilityVector, ...]) -> tuple[UtilityVector, ...]:
-    """The vectors that these candidates are compared by: of the robots that score all of them, if they are a majority.
+def _comparable(candidates: Iterable[NodeId], rows: Sequence[_Row]) -> Sequence[_Row]:
+    """The rows that these candidates are compared by: of the robots that score all of them, if they are a majority.
 
     A robot that is far away gives low values. If it leaves out one candidate, for a doubt of its own, that one would
     gain by it, and the task move there and back with every doubt. Else all count, each for what it scores.
     """
     wanted = set(candidates)
-    whole = tuple(one for one in vectors if wanted <= {utility.candidate for utility in one.utilities})
-    return whole if len(whole) >= majority(len(vectors)) else vectors
+    whole = [row for row in rows if wanted <= row.keys()]
+    return whole if len(whole) >= majority(len(rows)) else rows
 
 
 def _aggregates(
-    candidates: list[NodeId], vectors: tuple[UtilityVector, ...], mean: Callable[[list[float]], float]
+    candidates: list[NodeId], rows: Sequence[_Row], mean: Callable[[list[float]], float]
 ) -> dict[NodeId, float]:
-    told = [{one.candidate: one.value for one in vector.utilities} for vector in counted(candidates, vectors)]
-    return {name: mean([values[name] for values in told if name in values]) for name in candidates}
+    told = _comparable(candidates, rows)
+    return {name: mean([row[name].value for row in told if name in row]) for name in candidates}
 
 
 def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:
     """The candidate with the highest aggregate; ties (to 1/1024) go to the owner, then to the lowest name."""
     if not aggregates:
         return None
-    return min(aggregates, key=lambda name: (-rounded(aggregates[name]), name != owner, name))
+    close = max(aggregates.values()) - 2 * RESOLUTION
+    near = [name for name, value in aggregates.items() if value >= close]
+    return min(near, key=lambda name: (-rounded(aggregates[name]), name != owner, name))

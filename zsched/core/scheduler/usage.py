@@ -134,7 +134,7 @@ def _likely_cores(spec: TaskSpec, profile: Profile, load: WorkerLoad | None, dem
     use = profile.cpu_used_cores or 0.0
     if load is not None and load.jobs is not None and is_short(load):
         return min(load.jobs.done_hz * load.jobs.cpu_s, use)
-    threads = gateway.beside_unmeasured(spec, profile, demand.cpu_cores)
+    threads = gateway.shares.beside_unmeasured(spec.name, profile, demand.cpu_cores)
     if threads is None:
         return min(demand.cpu_cores, use)
     own, others = threads

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 
 from zsched.core.values.model import ScoreForm, Weights
 
@@ -24,7 +25,7 @@ def clamp(value: float) -> float:
     >>> clamp(1.2), clamp(-3.0)
     (1.0, 0.0)
     """
-    return min(max(value, 0.0), 1.0)
+    return value if 0.0 <= value <= 1.0 else min(max(value, 0.0), 1.0)
 
 
 def predicted_use(use: float, own_worker: float, demand: float) -> float:
@@ -101,13 +102,13 @@ def service_utility(
     >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0, most=1.0), 4)
     0.51
     """
-    room = max(free, 0.0) / max(demand, LEAST_NEED_RATIO * capacity)
-    if demand > 0.0:
+    room = clamp(free / max(demand, LEAST_NEED_RATIO * capacity))
+    if room < 1.0 and demand > 0.0:
         # By the need itself: a small task that gets all that it needs lacks as little on a large machine.
-        room, free = max(room, least / demand), max(free, min(least, demand))
+        room, free = clamp(max(room, least / demand)), max(free, min(least, demand))
     if most is not None and most < demand:
         room = min(room, most / demand)
-    return (1.0 - SPARE) * share * min(room, 1.0) + SPARE * clamp(free / capacity)
+    return (1.0 - SPARE) * share * room + SPARE * clamp(free / capacity)
 
 
 STEEPNESS = 4.0
@@ -160,7 +161,7 @@ def spare_factor(left: float, capacity: float, floor_ratio: float) -> float:
     [0.85, 0.85, 0.925, 1.0]
     """
     floor = floor_ratio * capacity
-    return 1.0 - NEARLY_FULL * clamp(1.0 - left / floor) if floor > 0.0 else 1.0
+    return 1.0 - NEARLY_FULL * clamp(1.0 - left / floor) if left < floor and floor > 0.0 else 1.0
 
 
 def memory_service(free: float, demand: float, capacity: float, floor_ratio: float) -> float:
@@ -194,54 +195,39 @@ def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:
     return clamp((signal_dbm - nu_dbm) / (rho_dbm - nu_dbm))
 
 
-NO_GAUGES: Mapping[str, float] = {}
-
-
-def total_utility(
-    weights: Weights,
-    *,
-    cpu: float | None,
-    memory: float | None,
-    network: float | None,
-    measured: frozenset[str],
-    form: ScoreForm = ScoreForm.PAPER,
-    gauges: Mapping[str, float] = NO_GAUGES,
-) -> float | None:
+class Total:
     """Eq. 4, the weighted sum; weights of metrics that nobody measured are dropped and the rest renormalised.
 
     `ScoreForm.SERVICE`: a product instead, each term to the power of its weight over the largest one. The metric that
     weighs most counts as it is, one of half its weight as its square root: a weight says by how many percent of it the
     utility falls when that term falls by one percent, whatever the others are.
 
-    Args:
-        weights: omega, sum 1.
-        cpu: eta, in [0, 1], or ``None`` when not measured here.
-        memory: sigma, likewise.
-        network: kappa, likewise.
-        measured: which of ``cpu``, ``memory``, ``network`` and the gauges any candidate has.
-        form: sum or product.
-        gauges: the gauges' terms, likewise in [0, 1]; a gauge that is not there was not measured here.
-
-    Returns:
-        The utility in [0, 1]; ``None`` when a weighted metric that others have is missing here, or nothing is left.
-
-    >>> w = Weights(cpu=0.5, memory=0.25, network=0.25)
-    >>> total_utility(w, cpu=0.8, memory=0.4, network=None, measured=frozenset({"cpu", "memory"}))
+    >>> total = Total(Weights(cpu=0.5, memory=0.25, network=0.25), {"cpu", "memory"})
+    >>> total.of({"cpu": 0.8, "memory": 0.4})
     0.6666666666666666
     """
-    terms = {"cpu": cpu, "memory": memory, "network": network, **gauges}
-    weighed: list[tuple[float, float]] = []
-    for name, weight in weights.shares:
-        term = terms.get(name)
-        if weight <= 0.0 or name not in measured:
-            continue
-        if term is None:
+
+    def __init__(self, weights: Weights, measured: AbstractSet[str], form: ScoreForm = ScoreForm.PAPER) -> None:
+        """``measured``: which of cpu, memory, network and the gauges any candidate has."""
+        self._shares = [(name, weight) for name, weight in weights.shares if weight > 0.0 and name in measured]
+        self._is_sum = form is ScoreForm.PAPER
+        weighed = [weight for _, weight in self._shares]
+        self._whole = sum(weighed, 0.0) if self._is_sum else max(weighed, default=1.0)
+
+    def of(self, terms: Mapping[str, float]) -> float | None:
+        """The utility in [0, 1]; ``None`` when a weighted metric that others have is missing, or nothing is left.
+
+        ``terms``: {metric: eta, sigma, kappa or a gauge's term, each in [0, 1]}, of those that are measured here.
+        """
+        total, product = 0.0, 1.0
+        for name, weight in self._shares:
+            term = terms.get(name)
+            if term is None:
+                return None
+            if self._is_sum:
+                total += weight * term
+            else:
+                product *= term ** (weight / self._whole)
+        if not self._shares:
             return None
-        weighed.append((weight, term))
-    if not weighed:
-        return None
-    if form is ScoreForm.PAPER:
-        share = sum((weight for weight, _ in weighed), 0.0)
-        return clamp(sum((weight * term for weight, term in weighed), 0.0) / share)
-    most = max(weight for weight, _ in weighed)
-    return clamp(math.prod(term ** (weight / most) for weight, term in weighed))
+        return clamp(total / self._whole if self._is_sum else product)

@@ -287,9 +287,9 @@ def test_what_a_task_needed_is_not_what_one_of_its_name_needs_that_comes_later(*
     for task in ("merge", "other"):
         shown = replace(learnt, workers=(replace(large, task=task),))
         assert node.gateway.demands.learn(task, shown, START)
-        assert node.gateway._shares.learn(task, shown, START)
+        assert node.gateway.shares.learn(task, shown, START)
     assert [node.gateway.demand(spec, small).memory_mb for spec in (merge, other)] == [20_000.0, 20_000.0]
-    assert node.gateway.share(merge, small, 1.0, 0.0) == pytest.approx(2 / 3)
+    assert node.gateway.shares.at("merge", small, 1.0, 0.0) == pytest.approx(2 / 3)
     if is_heard:
         adopt(node, without)
     else:
@@ -297,7 +297,7 @@ def test_what_a_task_needed_is_not_what_one_of_its_name_needs_that_comes_later(*
         node.registers["merge"].state = replace(node.registers["merge"].state, learnt=later)
     adopt(node, fleet)
     assert node.gateway.demand(merge, small) == merge.demand
-    assert node.gateway.share(merge, small, 1.0, 0.0) == pytest.approx(0.4)
+    assert node.gateway.shares.at("merge", small, 1.0, 0.0) == pytest.approx(0.4)
     assert node.gateway.demand(other, small).memory_mb == 20_000.0, "it has stayed"
 
 

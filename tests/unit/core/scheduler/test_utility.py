@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.equations import total_utility
 from zsched.core.scheduler import standing, utility
 from zsched.core.scheduler.standing import rounded
 from zsched.core.scheduler.utility import (
@@ -18,7 +19,6 @@ from zsched.core.scheduler.utility import (
     network_utility,
     predicted_use,
     service_utility,
-    total_utility,
 )
 from zsched.core.values import endpoint
 from zsched.core.values.fleet import DEFAULT_BONUS
