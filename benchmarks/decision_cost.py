@@ -27,7 +27,7 @@ from zsched.core.values.profile import Jobs, Link, LinkSource, Profile, WorkerLo
 from zsched.wire import codec as wire
 
 CANDIDATES, ROBOTS = (3, 10, 50, 200), (3, 10, 50)
-GOAL_MS = 5.0
+GOAL_MS = 2.0
 _WEIGHTS = Weights(cpu=0.4, memory=0.3, network=0.3)
 TUNINGS = {
     "service": Tuning(weights=_WEIGHTS, score=ScoreForm.SERVICE),
