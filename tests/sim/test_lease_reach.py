@@ -123,6 +123,17 @@ def test_an_owner_that_says_that_it_rests_is_left_for_one_that_has_not() -> None
     assert moves(sim) - before == 1
 
 
+def test_a_pinned_task_is_not_kept_where_it_rests() -> None:
+    sim = started(pinned=True)
+    sim.cuts.update(("edge1", name) for name in ELECTORS[:2])
+    sim.cuts.update(("base1", robot) for robot in ROBOTS)
+    before = moves(sim)
+    assert sim.run_until(lambda: working(sim) == "edge2", 8.0)
+    sim.run(45.0)
+    assert working(sim) == "edge2"
+    assert moves(sim) - before == 1
+
+
 @pytest.mark.parametrize(("down_s", "of_s", "within_s"), [(6.0, 6.2, 40.0), (5.0, 6.0, 40.0), (2.0, 3.0, 75.0)])
 def test_so_is_one_that_rests_again_and_again_and_never_for_long(down_s: float, of_s: float, within_s: float) -> None:
     """Each lease took all back that had been said of it: 16, 30 and 60 % of the time were worked, for good."""

@@ -200,9 +200,9 @@ def _enum_codec(hint: type[Enum]) -> tuple[Reader, Writer]:
     members = {member.value: member for member in hint}
 
     def read(value: Any) -> Enum:
-        if type(value) is not str or value not in members:
+        if type(value) is not str or not (value in members or "" in members):
             raise _fail(f"expected one of {sorted(members)}", value)
-        return members[value]
+        return members.get(value) or members[""]  # where nothing may be said, so may what a later program says
 
     return read, lambda value: value.value
 

@@ -325,6 +325,15 @@ def test_two_tasks_keep_together_or_spread_over_equal_machines(together: float, 
         assert sorted(one.owner or "" for one in fleet.values.values()) == expected
 
 
+@pytest.mark.parametrize(("one", "other"), [(0.2, -0.2), (0.2, 0.2), (-0.5, 0.5)])
+def test_tasks_that_seek_and_avoid_each_other_do_not_chase_each_other(one: float, other: float) -> None:
+    """400 moves in 200 s: a promise of company that runs away was never held against a machine."""
+    works = (Work(cores=0.6, beside=(("task2", one),)), Work(cores=0.54, beside=(("task1", other),)))
+    moves = Tasks((Machine(),) * 3, works, (1, 2), CPU_ONLY).run(150.0)
+    assert len(moves) <= 8
+    assert [at for at, _, _ in moves if at > 100.0] == []
+
+
 @pytest.mark.parametrize("first", [1, 2])
 def test_where_two_tasks_lack_cpu_the_one_of_less_priority_leaves(first: int) -> None:
     works = [Work(cores=0.8), Work(cores=0.8)]

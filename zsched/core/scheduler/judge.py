@@ -181,9 +181,9 @@ class Judge:
         owner = allocation.owner
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
-        self.kept.look(standing.aggregates, owner, now)
-        given = self.kept.corrected(standing.aggregates, owner, self.spec.memory_s, now)
-        worth = {name: value + head_starts.get(name, 0.0) for name, value in given.items()}
+        told = {name: value + head_starts.get(name, 0.0) for name, value in standing.aggregates.items()}
+        self.kept.look(told, owner, now)
+        worth = self.kept.corrected(told, owner, self.spec.memory_s, now)
         if owner in worth:
             worth[owner] += allocation.tuning.bonus
         home = allocation.home
@@ -192,8 +192,8 @@ class Judge:
             for name, value in worth.items()
             if (leaving is None or name != owner) and (not allocation.is_bound or name in (home, owner))
         }
-        self._watch_home(home in scored and home != owner, now)
-        owed = self._charge(worth, owner, now)
+        self._watch_home(home in scored and home != owner and not self.kept.has_failed(home, now), now)
+        owed = self._charge(worth, min(0.0, *head_starts.values(), 0.0), owner, now)
         expected = {name: owed[name] for name in scored}
         winner = (
             home if home is not None and home in scored else pick({name: -one for name, one in expected.items()}, owner)
@@ -201,7 +201,8 @@ class Judge:
         if winner is None:
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
-        is_kept = allocation.home is not None and not (is_unheard and winner != allocation.home)
+        rests = any(name == owner and veto.filter is Filter.RESTS for name, veto in standing.vetoed.items())
+        is_kept = home is not None and not rests and not (is_unheard and winner != home)
         outcome, reason = self._outcome(winner, expected, allocation, leaving, is_called, now, is_kept)
         cap = None
         if fuse is not None and owner is not None and not is_drain:
@@ -226,10 +227,12 @@ class Judge:
         elif self.fit_since is None:
             self.fit_since = now
 
-    def _charge(self, worth: Mapping[NodeId, float], owner: NodeId | None, now: float) -> dict[NodeId, float]:
-        """Charge everybody; {machine: what it owes, with what it will lose}. One without a worth loses all."""
+    def _charge(
+        self, worth: Mapping[NodeId, float], least: float, owner: NodeId | None, now: float
+    ) -> dict[NodeId, float]:
+        """Charge everybody; {machine: what it owes, with what it will lose}. ``least``: worth of one that has none."""
         names = dict.fromkeys((*self.spec.candidates, *worth, *(() if owner is None else (owner,))))
-        losses = {name: 1.0 - worth.get(name, 0.0) for name in sorted(names)}
+        losses = {name: 1.0 - worth.get(name, least) for name in sorted(names)}
         self.ledger.charge(losses, owner, price_s=self.spec.price_s, memory_s=self.spec.memory_s, now=now)
         return self.ledger.expected(losses)
 

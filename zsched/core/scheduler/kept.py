@@ -11,6 +11,7 @@ unseen is found by trying again: what was kept fades.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Mapping
 from typing import Final, Self
 
@@ -21,6 +22,8 @@ from zsched.core.values.struct import Struct, field
 
 SAME_WORTH: Final = 0.1
 """A promise is the same as long as it differs by at most this."""
+FAILED_S: Final = 60.0
+"""A machine that failed is not judged anew for so long."""
 
 
 class Kept(Struct):
@@ -57,8 +60,8 @@ class Kept(Struct):
     def look(self, worth: Mapping[NodeId, float], owner: NodeId | None, now: float) -> None:
         """Note what each machine is worth now, and what ``owner`` gives.
 
-        While the task's use still rises the newest figure counts, then the best one: a load that comes is not the
-        machine's doing. Until then what the machine gave before stays: one that fails so soon has not mended.
+        While the task's use still rises the least figure counts, that of before among them, then the best one: a load
+        that comes is not the machine's doing.
 
         >>> kept = Kept()
         >>> kept.look({"edge1": 0.6, "edge2": 0.9}, "edge1", now=0.0)
@@ -69,11 +72,10 @@ class Kept(Struct):
         if owner != self.owner:
             self.owner, self.since = owner, now
         if owner is not None and owner in worth and owner in self.foretold:
-            gave, has_settled, before = worth[owner], now - self.since >= SETTLE_S, self.seen.get(owner)
-            is_of_now = before is not None and before[2] >= self.since
-            if before is not None and is_of_now and has_settled:
-                gave = max(gave, before[1])
-            if before is None or is_of_now or has_settled:
+            gave, before = worth[owner], self.seen.get(owner)
+            if before is not None:
+                gave = (max if now - self.since >= SETTLE_S else min)(gave, before[1])
+            if before is None or before[2] <= now:
                 self.seen[owner] = (self.foretold[owner], gave, now)
         self.foretold |= {name: value for name, value in worth.items() if name != owner or name not in self.foretold}
 
@@ -81,7 +83,11 @@ class Kept(Struct):
         """The machine was left because it failed: it gave half of what it promised, or half of what it gave before."""
         if node in self.foretold:
             promised, gave, _ = self.seen.get(node, (self.foretold[node], self.foretold[node], now))
-            self.seen[node] = (promised, min(gave, promised) / 2.0, now)
+            self.seen[node] = (promised, min(gave, promised) / 2.0, now + FAILED_S)
+
+    def has_failed(self, node: NodeId | None, now: float) -> bool:
+        """Whether that was less than `FAILED_S` ago."""
+        return node in self.seen and self.seen[node][2] > now
 
     def unkept(self, worth: Mapping[NodeId, float], memory_s: float, now: float) -> dict[NodeId, float]:
         """{machine: what is taken off its worth}, of those from which something is."""
@@ -94,7 +100,6 @@ class Kept(Struct):
         """What each machine is worth by what it has kept; half of that is forgotten in ``memory_s``."""
         found = dict(worth)
         for name, (promised, gave, at) in self.seen.items():
-            value = found.get(name, 0.0)
-            if name != owner and gave < value <= promised + SAME_WORTH and value >= promised - SAME_WORTH:
-                found[name] = value - (value - gave) * 0.5 ** ((now - at) / memory_s)
+            if name != owner and gave < promised and abs(found.get(name, math.inf) - promised) <= SAME_WORTH:
+                found[name] -= (promised - gave) * 0.5 ** (max(now - at, 0.0) / memory_s)
         return found

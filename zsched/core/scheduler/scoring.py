@@ -142,7 +142,8 @@ class _View:
         self._states, self._now, self._bookings, self._doubts = states, now, bookings, doubts
         owner = allocation.owner
         told, own = None if owner is None else gateway.fresh(owner, now), signals_of(gateway.fresh(voter, now))
-        may_keep = owner in spec.candidates and owner not in doubts.unfit
+        rests = told is not None and told.rests(spec.name)
+        may_keep = owner in spec.candidates and owner not in doubts.unfit and not rests
         has_owner = (
             owner is not None
             and may_keep

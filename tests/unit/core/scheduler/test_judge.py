@@ -404,6 +404,21 @@ def test_a_pinned_task_without_an_owner_goes_to_its_node_at_once() -> None:
     assert (other.outcome, other.candidate) == (Outcome.WAIT, None)
 
 
+@pytest.mark.parametrize("spread", [0.3, 0.6, 1.0])
+def test_an_owner_that_cannot_be_scored_is_left_also_for_a_machine_that_the_file_avoids(spread: float) -> None:
+    judge, vetoed = Judge(spec=SPEC), {"edge1": Veto(Filter.LIMIT, "battery is at 3 %, limit 20 %")}
+    for tick in range(10):
+        told = judge.judge(
+            standing({"edge2": 0.6}, vetoed),
+            allocation(),
+            escape=None,
+            is_called=False,
+            now=tick * 0.5,
+            head_starts={"edge2": -spread},
+        )
+    assert (told.outcome, told.candidate) == (Outcome.PROPOSE, "edge2")
+
+
 # --- escape_reason -------------------------------------------------------------------------------------------------
 
 
