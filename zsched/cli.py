@@ -23,19 +23,18 @@ import typer
 from zsched.commands import daemon_verbs as daemon
 from zsched.commands import doctor_verbs as doctor
 from zsched.commands import document_verbs as document
-from zsched.commands import flag_verbs as flag
+from zsched.commands import fleet_verbs as fleet
 from zsched.commands import member_verbs as member
 from zsched.commands import order_verbs as order
+from zsched.commands import pki_verbs as pki
 from zsched.commands import program_verbs as about
 from zsched.commands import question_verbs as question
+from zsched.commands import stream_verbs as stream
 from zsched.commands import watch_verbs as watch
-from zsched.commands.common import Verb, warn
-from zsched.commands.fleet_verbs import fleet_app, node_app, task_app
-from zsched.commands.pki_verbs import pki_app
+from zsched.commands.common import warn
+from zsched.commands.options import add_verb
 from zsched.commands.program import Program
-from zsched.commands.question_verbs import metrics_app
 from zsched.commands.rehearse_verb import rehearse
-from zsched.commands.stream_verbs import stream_app
 from zsched.exits import EXIT_FAILED
 
 EPILOG = (
@@ -79,13 +78,13 @@ UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Why stdout takes no more: the disk behind ``>`` is full, or gone."""
 
 
-GROUPS = (stream_app, fleet_app, task_app, node_app, pki_app, metrics_app)
+GROUPS = (stream.GROUP, member.FLEET, fleet.TASK, fleet.NODE, pki.GROUP, question.METRICS)
 VERBS: tuple[Callable[..., None], ...] = (
     *(daemon.up, daemon.init, daemon.recover, daemon.rejoin, daemon.dev),
     *(question.status, question.site, watch.top, watch.web, watch.record, watch.trace),
     *(question.explain, question.history, question.events, question.replay),
     *(order.move, order.pin, order.unpin, order.pause, order.resume, order.tune),
-    *(order.restart, flag.drain, flag.undrain),
+    *(order.restart, order.drain, order.undrain),
     *(member.invite, member.join, member.leave, rehearse),
     *(doctor.doctor, doctor.ping, doctor.bugreport, question.wait, question.logs),
     *(document.check, document.apply, document.edit),
@@ -97,7 +96,7 @@ HIDDEN = ("complete",)
 for group in GROUPS:
     app.add_typer(group)
 for verb in VERBS:
-    app.command(cls=Verb, hidden=verb.__name__ in HIDDEN)(verb)
+    add_verb(app, verb, is_hidden=verb.__name__ in HIDDEN)
 
 
 def _leave_out_others(word: str) -> None:

@@ -15,7 +15,7 @@ from typing import TextIO
 
 from zsched import paths as places
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, check_dangers, check_reason, print_json, say, says_yes, warn
+from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, print_json, say, says_yes, warn
 from zsched.commands.document import (
     QUESTION,
     InForce,
@@ -57,7 +57,7 @@ class ApplyView(Struct, frozen=True, kw_only=True):
     """How a change is shown and confirmed."""
 
     words: tuple[str, ...]
-    """The verb with its arguments, to be shown where it must be given again."""
+    """The verb with its arguments, for the fleet's history."""
     is_plan: bool = False
     is_sure: bool = False
     is_json: bool = False
@@ -70,21 +70,11 @@ class ApplyView(Struct, frozen=True, kw_only=True):
     """Stdout is for something else: messages go to stderr."""
     pause_after: int | None = None
     """The number of candidates of each task that run a changed worker while the others wait; ``None``: none waits."""
-    where: tuple[str, ...] = ()
-    """The words that say which daemon is asked, and by which files of this machine."""
 
     @property
     def out(self) -> TextIO:
         """Where messages go."""
         return sys.stderr if self.is_data else sys.stdout
-
-    def again(self, *more: str) -> str:
-        """The command, with more words."""
-        kept = [part for name in self.accepted for part in ("--accept", name)]
-        kept += ["-m", self.reason] if self.reason else []
-        kept += ["--revision", str(self.revision)] if self.revision is not None else []
-        kept += ["--pause-after", str(self.pause_after)] if self.pause_after is not None else []
-        return shlex.join(("zsched", *self.words, *kept, *self.where, *more))
 
 
 class Plan(Struct, frozen=True, kw_only=True):
@@ -170,7 +160,7 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
     if missing:
         names = [part for name in dict.fromkeys(name for name, _ in missing) for part in ("--accept", name)]
         lines = "\n".join(f"  {name}: {means}" for name, means in missing)
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{view.again(*names)}")
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again(*names)}")
     _confirm(view, plan)
     return _commit(door, view, plan)
 
@@ -356,7 +346,7 @@ def _confirm(view: ApplyView, plan: Plan) -> None:
     if view.is_sure:
         return
     if not sys.stdin.isatty() or view.words[-1] == STDIN:
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{view.again('--yes')}")
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{again('--yes')}")
     if not says_yes(f"Change {plan.held.fleet} for all its nodes?", sys.stderr):
         raise CliError(EXIT_FAILED, "nothing was changed")
 

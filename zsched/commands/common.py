@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
@@ -265,6 +266,11 @@ def counted(number: int, plural: str) -> str:
     ('1 node', '2 nodes')
     """
     return f"{number} {plural if number != 1 else plural.removesuffix('s')}"
+
+
+def again(*more: str) -> str:
+    """The command as it was given, with more words: to be copied."""
+    return shlex.join(["zsched", *sys.argv[1:], *more])
 
 
 def says_yes(question: str, stream: TextIO) -> bool:

@@ -13,8 +13,7 @@ import typer
 
 from zsched.commands.common import CliError
 from zsched.commands.example import Example, give_example
-from zsched.commands.fleet_verbs import AcceptOption
-from zsched.commands.options import ConfigOption, NameOption, PlanOption, RuntimeOption, StateOption, YesOption
+from zsched.commands.options import AcceptOption, Here, Machine, PlanOption, YesOption
 from zsched.exits import EXIT_USAGE
 
 
@@ -28,28 +27,23 @@ class LogLevel(StrEnum):
 
 
 def up(
-    config: ConfigOption = None,
-    node: NameOption = None,
-    state_dir: StateOption = None,
-    runtime_dir: RuntimeOption = None,
+    here: Machine,
     log_level: Annotated[LogLevel, typer.Option("--log-level", help="What goes to stderr.")] = LogLevel.INFO,
 ) -> None:
     """Run this machine's daemon in the foreground (what systemd runs)."""
     from zsched.commands.up import become_daemon  # noqa: PLC0415 - each verb imports what it needs
 
-    become_daemon(config, node, state_dir, runtime_dir, log_level.value)
+    become_daemon(here.config, here.node, here.state_dir, here.runtime_dir, log_level.value)
 
 
 def init(
+    here: Here,
     folder: Annotated[
         Path | None, typer.Argument(metavar="DIR", help="With --example: where; without it the current folder.")
     ] = None,
     example: Annotated[
         Example | None, typer.Option("--example", help="Write an example into DIR instead; nothing is overwritten.")
     ] = None,
-    config: ConfigOption = None,
-    node: NameOption = None,
-    state_dir: StateOption = None,
     generation: Annotated[
         int,
         typer.Option("--generation", metavar="G", min=0, help="Above 0: start anew, on every node."),
@@ -77,7 +71,7 @@ def init(
     With --example it writes no state but a small task: a fleet file, a worker, an application (see `zsched dev`).
     """
     if example is not None:
-        if config or node or state_dir or generation or force or settle or accept:
+        if here.config or here.node or here.state_dir or generation or force or settle or accept:
             raise CliError(EXIT_USAGE, "--example goes with a folder only")
         give_example(example, folder or Path())
         return
@@ -85,13 +79,12 @@ def init(
         raise CliError(EXIT_USAGE, f"{folder}: a folder goes with --example; name the state folder with --state-dir")
     from zsched.commands.init import create_state  # noqa: PLC0415 - each verb imports what it needs
 
-    create_state(config, node, state_dir, generation, is_forced=force, is_settling=settle, accepted=accept or ())
+    place = (here.config, here.node, here.state_dir)
+    create_state(*place, generation, is_forced=force, is_settling=settle, accepted=accept or ())
 
 
 def recover(
-    config: ConfigOption = None,
-    node: NameOption = None,
-    state_dir: StateOption = None,
+    here: Here,
     brought: Annotated[
         list[Path] | None,
         typer.Option("--from", metavar="STATE_FILE", help="State of a dead machine's disk; give it once for each."),
@@ -105,22 +98,18 @@ def recover(
     Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
     refused while a majority of the electors can agree. Every other node changes sides by `zsched rejoin` there.
     """
-    from zsched.commands.recover import Manner, place_of, words_of  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.recover import Manner, place_of  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.recover import recover as run  # noqa: PLC0415 - as above
 
-    words = ["recover", *words_of(config, node, state_dir)]
-    words += [part for path in brought or () for part in ("--from", str(path))]
-    manner = Manner(words=tuple(words), is_plan=plan, is_sure=yes, accepted=tuple(accept or ()))
-    raise typer.Exit(run(place_of(config, node, state_dir), manner, tuple(brought or ())))
+    manner = Manner(is_plan=plan, is_sure=yes, accepted=tuple(accept or ()))
+    raise typer.Exit(run(place_of(here.config, here.node, here.state_dir), manner, tuple(brought or ())))
 
 
 def rejoin(
+    here: Here,
     generation: Annotated[
         str, typer.Argument(metavar="[GENERATION]", help="The beginning of its id; needed where there are several.")
     ] = "",
-    config: ConfigOption = None,
-    node: NameOption = None,
-    state_dir: StateOption = None,
     plan: PlanOption = False,
     yes: YesOption = False,
 ) -> None:
@@ -128,12 +117,11 @@ def rejoin(
 
     It starts blank there: what it has promised and learnt in its own generation is dropped. Its daemon must be stopped.
     """
-    from zsched.commands.recover import Manner, place_of, words_of  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.recover import Manner, place_of  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.recover import rejoin as run  # noqa: PLC0415 - as above
 
-    words = ("rejoin", *([generation] if generation else []), *words_of(config, node, state_dir))
-    manner = Manner(words=words, is_plan=plan, is_sure=yes)
-    raise typer.Exit(run(place_of(config, node, state_dir), manner, generation))
+    manner = Manner(is_plan=plan, is_sure=yes)
+    raise typer.Exit(run(place_of(here.config, here.node, here.state_dir), manner, generation))
 
 
 def dev(

@@ -10,29 +10,23 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.options import ConfigOption, JsonOption, NameOption, RuntimeOption, StateOption
+from zsched.commands.options import JsonOption, Machine, NameOption, NoColorOption, RuntimeOption
 
 
 def doctor(
+    here: Machine,
     fleet: Annotated[bool, typer.Option("--fleet", help="Ask every node, and compare what they say.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on a warning, too.")] = False,
     json_: JsonOption = False,
-    config: ConfigOption = None,
-    node: NameOption = None,
-    state_dir: StateOption = None,
-    runtime_dir: RuntimeOption = None,
-    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+    no_color: NoColorOption = False,
 ) -> None:
     """Look for what is wrong with this machine, its daemon, or the whole fleet, and say what to do.
 
     Each check says PASS, WARN, FAIL or SKIP, and what it saw. It changes nothing. Exits with 1 on a FAIL.
     """
-    from zsched.commands.doctor import diagnose, machine_of  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.here import own_name  # noqa: PLC0415 - as above
+    from zsched.commands.doctor import diagnose  # noqa: PLC0415 - each verb imports what it needs
 
-    own_name(node)
-    machine = machine_of(config, node, state_dir, runtime_dir)
-    raise typer.Exit(diagnose(machine, is_fleet=fleet, is_strict=strict, is_json=json_, is_plain=no_color))
+    raise typer.Exit(diagnose(here.machine(), is_fleet=fleet, is_strict=strict, is_json=json_, is_plain=no_color))
 
 
 def ping(
@@ -51,8 +45,8 @@ def ping(
 
     Exits with 3 when the node answers by no way, with 1 when by some only.
     """
-    from zsched.commands.here import own_name  # noqa: PLC0415 - as above
-    from zsched.commands.ping import Question, ping_node  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.here import own_name  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.ping import Question, ping_node  # noqa: PLC0415 - as above
 
     own_name(node)
     question = Question(node=whom, count=count, timeout_s=timeout, interval_s=interval)
@@ -60,22 +54,16 @@ def ping(
 
 
 def bugreport(
+    here: Machine,
     file: Annotated[
         Path | None, typer.Argument(metavar="[FILE]", help="A new file. [zsched-bugreport-NODE-TIME.tar.gz]")
     ] = None,
     json_: JsonOption = False,
-    config: ConfigOption = None,
-    node: NameOption = None,
-    state_dir: StateOption = None,
-    runtime_dir: RuntimeOption = None,
 ) -> None:
     """Write one file for the person who looks for a fault: every node's status, the doctor's words, the journal.
 
     Secrets that a name gives away are taken out. It prints what is in the file.
     """
     from zsched.commands.bugreport import report  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.doctor import machine_of  # noqa: PLC0415 - as above
-    from zsched.commands.here import own_name  # noqa: PLC0415 - as above
 
-    own_name(node)
-    raise typer.Exit(report(machine_of(config, node, state_dir, runtime_dir), file, is_json=json_))
+    raise typer.Exit(report(here.machine(), file, is_json=json_))

@@ -10,21 +10,7 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.fleet_verbs import (
-    AcceptOption,
-    PauseAfterOption,
-    ReasonOption,
-    RevisionOption,
-)
-from zsched.commands.options import (
-    AskedOption,
-    ConfigOption,
-    ConnectOption,
-    JsonOption,
-    PlanOption,
-    RuntimeOption,
-    YesOption,
-)
+from zsched.commands.options import Changes, ConfigOption, Edits, JsonOption, PauseAfterOption
 
 
 def check(
@@ -43,17 +29,9 @@ def check(
 
 
 def apply(
+    said: Changes,
     file: Annotated[str, typer.Argument(metavar="FILE", help="Fleet file; -: stdin.")],
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    revision: RevisionOption = None,
-    accept: AcceptOption = None,
     pause_after: PauseAfterOption = None,
-    reason: ReasonOption = "",
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Change the running fleet to what a fleet file says: shows what follows, asks, and has it agreed for all nodes.
 
@@ -62,54 +40,17 @@ def apply(
     """
     from zsched.commands.apply import apply as change  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.apply import read_text  # noqa: PLC0415 - as above
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
-    from zsched.commands.fleet_verbs import view_of  # noqa: PLC0415 - as above
 
-    words = ("apply", file)
-    view = view_of(
-        words,
-        plan=plan,
-        yes=yes,
-        revision=revision,
-        accept=accept,
-        reason=reason,
-        is_json=json_,
-        pause_after=pause_after,
-        at=(node, runtime_dir, connect),
-    )
-    door = find_door(runtime_dir, node, connect=connect)
+    view, door = said.change("apply", file, pause_after=pause_after), said.door()
     text = read_text(file)
     raise typer.Exit(change(door, view, lambda _held: text, file))
 
 
-def edit(
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    revision: RevisionOption = None,
-    accept: AcceptOption = None,
-    pause_after: PauseAfterOption = None,
-    reason: ReasonOption = "",
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
+def edit(said: Edits, pause_after: PauseAfterOption = None) -> None:
     """Open the fleet's document in your editor (VISUAL, EDITOR, else vi), and apply what comes of it.
 
     A text with faults, or one that is refused, stays in a file that the message names.
     """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.fleet import edit as open_document  # noqa: PLC0415 - as above
-    from zsched.commands.fleet_verbs import view_of  # noqa: PLC0415 - as above
+    from zsched.commands.fleet import edit as open_document  # noqa: PLC0415 - each verb imports what it needs
 
-    view = view_of(
-        ("edit",),
-        plan=plan,
-        yes=yes,
-        revision=revision,
-        accept=accept,
-        reason=reason,
-        is_json=False,
-        at=(node, runtime_dir, connect),
-        pause_after=pause_after,
-    )
-    raise typer.Exit(open_document(find_door(runtime_dir, node, connect=connect), view))
+    raise typer.Exit(open_document(said.door(), said.change("edit", pause_after=pause_after)))

@@ -7,15 +7,13 @@ agreed (`zsched.commands.document`), what a robot makes of a flag (`zsched.core.
 from __future__ import annotations
 
 import contextlib
-import shlex
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, check_dangers, nearest, print_json, say, told_task
+from zsched.commands.common import CliError, Json, again, check_dangers, nearest, print_json, say, told_task
 from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT
 from zsched.commands.orders import (
@@ -310,8 +308,7 @@ def _check_dangers(
     if view.is_plan and not view.is_json:
         say(means)
     if not view.is_plan and not accepted:
-        again = shlex.join(["zsched", *sys.argv[1:], "--accept", NO_OTHER])
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n  {means}\n{again}")
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n  {means}\n{again('--accept', NO_OTHER)}")
     return means
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import shlex
 import time
 from pathlib import Path
 from typing import Final
@@ -19,7 +18,7 @@ from typing import Final
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, check_dangers, check_reason, say, warn
+from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, say, warn
 from zsched.commands.document import QUESTION, UNKNOWING, InForce, ask_all, change, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.flags import (
@@ -78,13 +77,6 @@ class LeaveOrder(Struct, frozen=True, kw_only=True):
     is_plan: bool = False
     is_yes: bool = False
     is_json: bool = False
-    options: tuple[str, ...] = ()
-    """Those that were given and that the command needs again."""
-
-    @property
-    def verb(self) -> str:
-        """The command as it is to be given again."""
-        return shlex.join(("zsched", "leave", *self.options))
 
 
 class Way(Struct, frozen=True, kw_only=True):
@@ -114,8 +106,8 @@ class Way(Struct, frozen=True, kw_only=True):
         """
         passed_s = monotonic_s() - self.began
         if passed_s >= self.order.deadline_s:
-            again = f"give `{self.order.verb}` again to go on, or take it back: zsched undrain {self.me}"
-            raise CliError(EXIT_TIMED_OUT, f"{self.me} has not left after {span(passed_s)}: {lacks}; {again}")
+            advice = f"give `{again()}` again to go on, or take it back: zsched undrain {self.me}"
+            raise CliError(EXIT_TIMED_OUT, f"{self.me} has not left after {span(passed_s)}: {lacks}; {advice}")
 
 
 def leave(order: LeaveOrder) -> int:
@@ -493,7 +485,7 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
         except AdapterError as error:
             if monotonic_s() > until:
                 told = f"{done}, and its daemon does not end: {error}"
-                raise CliError(EXIT_TIMED_OUT, f"{told}; stop it, then give `{way.order.verb}` again") from error
+                raise CliError(EXIT_TIMED_OUT, f"{told}; stop it, then give `{again()}` again") from error
             time.sleep(PAUSE_S)
         else:
             way.tell(f"{way.me}: the daemon has ended")

@@ -11,11 +11,10 @@ import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from zsched.clock import monotonic_s, wall_ns
-from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import Away, CliError, Json, nearest, print_json, warn
 from zsched.commands.page import clock_time
 from zsched.core.values.struct import Struct
@@ -73,9 +72,7 @@ class Sieve:
 class LogsView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
-    runtime_dir: Path | None
-    node: str | None
-    connect: str | None
+    door: Door
     is_json: bool
     is_followed: bool
     most: int
@@ -102,7 +99,7 @@ def show_logs(view: LogsView, task: str, whose: str | None) -> int:
     if view.level is not None and view.level not in LEVELS:
         raise CliError(EXIT_USAGE, f"--level: there is no level {view.level!r}{nearest(view.level, LEVELS)}")
     sieve = Sieve(view.level)
-    door = find_door(view.runtime_dir, view.node, connect=view.connect)
+    door = view.door
     node = worker_node(ask_door(door, {"verb": "status"}), task, whose)
     asked = door.to(node)
     kept, after = _all_lines(asked, task, 0)

@@ -7,34 +7,28 @@ the verb that runs).
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Verb
-from zsched.commands.fleet_verbs import (
-    AcceptOption,
-    ReasonOption,
-    RevisionOption,
-    fleet_app,
-    view_of,
-)
+from zsched.commands import fleet_verbs as fleet
+from zsched.commands.common import CliError
 from zsched.commands.options import (
-    AskedOption,
-    ConfigOption,
-    ConnectOption,
+    AcceptOption,
+    Edits,
+    Files,
+    Here,
     JsonOption,
+    OutputOption,
     PlanOption,
+    ReasonOption,
     RuntimeOption,
-    StateOption,
     YesOption,
+    new_group,
 )
-
-if TYPE_CHECKING:
-    from zsched.runtime.membership import Places
+from zsched.exits import EXIT_USAGE
 
 
 class Kind(StrEnum):
@@ -52,28 +46,12 @@ class Profile(StrEnum):
     WAN = "wan"
 
 
-def _given(options: Iterable[tuple[str, object]]) -> tuple[str, ...]:
-    """The words of those options that have a value."""
-    return tuple(word for option, value in options if value is not None for word in (option, str(value)))
-
-
 AddressHelp = "HOST or HOST:PORT of its control session; its data session has the next port."
 
 
-def _places(config: Path | None, state_dir: Path | None) -> Places:
-    from zsched import paths  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.runtime.membership import Places  # noqa: PLC0415 - as above
-
-    return Places(config=paths.config_path(config, os.environ), state=paths.state_folder(state_dir, os.environ))
-
-
-@fleet_app.command("create", cls=Verb)
-def fleet_create(
+def create(
+    here: Here,
     name: Annotated[str, typer.Argument(metavar="NAME", help="The new fleet's name.")],
-    node: Annotated[
-        str | None,
-        typer.Option("--node", "-n", metavar="NAME", help="This machine's name. [ZSCHED_NODE, else the host name]"),
-    ] = None,
     kind: Annotated[
         Kind, typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works.")
     ] = Kind.ROBOT,
@@ -92,8 +70,6 @@ def fleet_create(
     accept: AcceptOption = None,
     plan: PlanOption = False,
     json_: JsonOption = False,
-    config: ConfigOption = None,
-    state_dir: StateOption = None,
 ) -> None:
     """Make this machine the first one of a new fleet: writes its fleet file, state, authority and certificate.
 
@@ -105,11 +81,11 @@ def fleet_create(
 
     view = CreateView(
         fleet=name,
-        node=paths.node_name(node, os.environ),
+        node=paths.node_name(here.node, os.environ),
         kind=NodeKind(kind.value),
         timing=timing.value,
         address=address,
-        places=_places(config, state_dir),
+        places=here.places(),
         is_secured=not insecure,
         authority=authority,
         asks_passphrase=passphrase,
@@ -121,6 +97,7 @@ def fleet_create(
 
 
 def invite(
+    said: Edits,
     name: Annotated[str, typer.Argument(metavar="NAME", help="The new machine's name in the fleet.")],
     kind: Annotated[
         Kind | None,
@@ -133,9 +110,7 @@ def invite(
         list[str] | None,
         typer.Option("--candidate-for", metavar="TASK", help="It may own this task; give it once for each."),
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Where to; else stdout.")
-    ] = None,
+    output: OutputOption = None,
     authority: Annotated[
         Path | None,
         typer.Option("--authority", metavar="DIR", help="In a secured fleet: who signs. [as of zsched pki]"),
@@ -144,14 +119,6 @@ def invite(
         Path | None,
         typer.Option("--csr", metavar="FILE", help="In a secured fleet: its request; its key stays where it was made."),
     ] = None,
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    revision: RevisionOption = None,
-    accept: AcceptOption = None,
-    reason: ReasonOption = "",
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Add a machine to the fleet, and write the file with which it joins (`zsched join`).
 
@@ -159,33 +126,23 @@ def invite(
     has the authority.
     For a node that was never there it is written once more, with another key: the former one is revoked.
     """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.membership import Guest  # noqa: PLC0415 - as above
+    from zsched.commands.membership import Guest  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.membership import invite as bring  # noqa: PLC0415 - as above
     from zsched.core.values.model import NodeKind  # noqa: PLC0415 - as above
-    from zsched.core.values.struct import replace  # noqa: PLC0415 - as above
 
-    tasks = tuple(candidate_for or ())
-    options: list[tuple[str, object]] = [("--kind", None if kind is None else kind.value), ("--address", address)]
-    options += [*(("--candidate-for", task) for task in tasks), ("--output", output), ("--csr", csr)]
-    view = view_of(
-        ("invite", name, *_given(options)),
-        plan=plan,
-        yes=yes,
-        revision=revision,
-        accept=accept,
-        reason=reason,
-        is_json=False,
-        is_data=True,
-        at=(node, runtime_dir, connect),
+    guest = Guest(
+        name=name,
+        kind=None if kind is None else NodeKind(kind.value),
+        address=address,
+        tasks=tuple(candidate_for or ()),
+        authority=authority,
+        request=csr,
     )
-    view = replace(view, where=(*_given([("--authority", authority)]), *view.where))  # no word of the fleet's history
-    said = None if kind is None else NodeKind(kind.value)
-    guest = Guest(name=name, kind=said, address=address, tasks=tasks, authority=authority, request=csr)
-    raise typer.Exit(bring(find_door(runtime_dir, node, connect=connect), view, guest, output))
+    raise typer.Exit(bring(said.door(), said.change("invite", name, is_data=True), guest, output))
 
 
 def join(
+    here: Files,
     file: Annotated[str | None, typer.Argument(metavar="[FILE]", help="What `zsched invite` wrote; -: stdin.")] = None,
     request: Annotated[
         str | None,
@@ -196,8 +153,6 @@ def join(
     ] = None,
     plan: PlanOption = False,
     json_: JsonOption = False,
-    config: ConfigOption = None,
-    state_dir: StateOption = None,
 ) -> None:
     """Make this machine the node that an invitation names: writes its fleet file, state and certificate.
 
@@ -205,21 +160,21 @@ def join(
     Nothing of another fleet is touched: it is refused. Start the daemon then; it votes as soon as it hears the others.
     """
     from zsched.commands import membership  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.exits import EXIT_USAGE  # noqa: PLC0415 - as above
 
     if (file is None) == (request is None):
         raise CliError(EXIT_USAGE, "give the invitation's file, or --request NAME before you have one")
     if request is not None:
         if plan:
             raise CliError(EXIT_USAGE, "--plan goes with an invitation: --request writes a key and a request only")
-        raise typer.Exit(membership.request(request, _places(config, state_dir), output, is_json=json_))
+        raise typer.Exit(membership.request(request, here.places(), output, is_json=json_))
     assert file is not None
     if output is not None:
         raise CliError(EXIT_USAGE, "--output goes with --request")
-    raise typer.Exit(membership.join(file, _places(config, state_dir), is_plan=plan, is_json=json_))
+    raise typer.Exit(membership.join(file, here.places(), is_plan=plan, is_json=json_))
 
 
 def leave(
+    here: Files,
     purge: Annotated[
         bool,
         typer.Option("--purge", help="Delete this machine's files of the fleet, its key too; else they are renamed."),
@@ -232,8 +187,6 @@ def leave(
     plan: PlanOption = False,
     yes: YesOption = False,
     json_: JsonOption = False,
-    config: ConfigOption = None,
-    state_dir: StateOption = None,
     runtime_dir: RuntimeOption = None,
 ) -> None:
     """Take this machine out of its fleet: its tasks move away, its seat among the electors too, and its daemon ends.
@@ -246,15 +199,8 @@ def leave(
     from zsched.commands.leave import LeaveOrder  # noqa: PLC0415 - as above
     from zsched.commands.leave import leave as go  # noqa: PLC0415 - as above
 
-    options: list[tuple[str, object]] = [("--accept", name) for name in accept or ()]
-    options += [
-        ("-m", reason or None),
-        ("--config", config),
-        ("--state-dir", state_dir),
-        ("--runtime-dir", runtime_dir),
-    ]
     order = LeaveOrder(
-        places=_places(config, state_dir),
+        places=here.places(),
         runtime_dir=runtime_dir,
         is_purged=purge,
         deadline_s=duration_s(deadline),
@@ -263,6 +209,12 @@ def leave(
         is_plan=plan,
         is_yes=yes,
         is_json=json_,
-        options=(*(["--purge"] if purge else []), *_given(options)),
     )
     raise typer.Exit(go(order))
+
+
+FLEET = new_group(
+    "fleet",
+    "The document that all nodes of the fleet go by.",
+    {"show": fleet.show, "export": fleet.export, "create": create},
+)

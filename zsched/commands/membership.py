@@ -19,7 +19,7 @@ from typing import Final
 from zsched import paths as places
 from zsched.commands.apply import ApplyView, apply
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
-from zsched.commands.common import CliError, Json, check_name, nearest, print_json, say, uninterrupted, warn
+from zsched.commands.common import CliError, Json, again, check_name, nearest, print_json, say, uninterrupted, warn
 from zsched.commands.document import InForce, document_text, in_force, status_of
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.papers import (
@@ -308,7 +308,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     """
     check_name(guest.name)
     if file is None and sys.stdout.isatty() and not view.is_plan:
-        raise CliError(EXIT_USAGE, f"the invitation is a file: {view.again()} > {guest.name}.invite")
+        raise CliError(EXIT_USAGE, f"the invitation is a file: {again()} > {guest.name}.invite")
     if file is not None and not os.access(file.parent, os.W_OK):
         raise CliError(EXIT_FAILED, f"{file}: that folder takes no file; nothing was done, name another one")
     if file is None and not view.is_plan:

@@ -13,11 +13,11 @@ import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from zsched.commands.ask import ask_door, find_door
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, uninterrupted
 from zsched.commands.report import all_problems, degradations
 from zsched.core.values.problems import Problem, of_kind
@@ -176,13 +176,13 @@ def _value(value: float) -> str:
 # --- the verbs -------------------------------------------------------------------------------------------------------
 
 
-def print_metrics(runtime_dir: Path | None, node: str | None, connect: str | None) -> int:
+def print_metrics(find: Callable[[], Door]) -> int:
     """Print the text; returns the exit code."""
-    sys.stdout.write(metrics_text(ask_door(find_door(runtime_dir, node, connect=connect), {"verb": "status"})))
+    sys.stdout.write(metrics_text(ask_door(find(), {"verb": "status"})))
     return EXIT_OK
 
 
-def write_metrics(path: Path, runtime_dir: Path | None, node: str | None, connect: str | None) -> int:
+def write_metrics(path: Path, find: Callable[[], Door]) -> int:
     """Write the text to a file, whole or not at all; returns the exit code.
 
     Where nobody answers the file says ``zsched_up 0``: figures of before would be taken for today's.
@@ -192,7 +192,7 @@ def write_metrics(path: Path, runtime_dir: Path | None, node: str | None, connec
         ConfigError: this machine has no certificate with which to ask.
     """
     try:
-        text = metrics_text(ask_door(find_door(runtime_dir, node, connect=connect), {"verb": "status"}))
+        text = metrics_text(ask_door(find(), {"verb": "status"}))
     except ZschedError:
         _replace(path, down_text())
         raise

@@ -1,14 +1,27 @@
-"""Options that several verbs take: each is declared once.
+"""Options that several verbs take: each is declared once, and a verb takes a whole set of them as one parameter.
 
 Knows: their names, words and the environment that stands in for them. Does not know: any verb.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from zsched.commands.common import Verb, Verbs
+
+if TYPE_CHECKING:
+    from zsched.commands.apply import ApplyView
+    from zsched.commands.ask import Door
+    from zsched.commands.orders import OrderView
+    from zsched.doctor import look as doctor
+    from zsched.runtime.membership import Places
 
 ConfigOption = Annotated[
     Path | None,
@@ -44,3 +57,210 @@ PlanOption = Annotated[
     bool, typer.Option("--plan", "--dry-run", help="Only show what would change; exits with 10 if anything.")
 ]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; off a terminal it takes this.")]
+ReasonOption = Annotated[str, typer.Option("--reason", "-m", metavar="TEXT", help="Why; the history tells it.")]
+RevisionOption = Annotated[
+    int | None, typer.Option("--revision", min=0, metavar="N", help="Only if this is still the revision.")
+]
+AcceptOption = Annotated[
+    list[str] | None, typer.Option("--accept", metavar="DANGER", help="Accept this danger; give it once for each.")
+]
+ForOption = Annotated[
+    str | None, typer.Option("--for", metavar="DURATION", help="End it by itself: 90s, 10m, 2h, 1d. [until taken back]")
+]
+NoColorOption = Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")]
+AgeOption = Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")]
+TaskArgument = Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")]
+OutputOption = Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help="Where to; else stdout.")]
+PauseAfterOption = Annotated[
+    int | None,
+    typer.Option(
+        "--pause-after",
+        min=1,
+        max=1000,
+        metavar="N",
+        help="Changed workers start on N candidates, and wait for `zsched task promote`.",
+    ),
+]
+
+
+class Options:
+    """A set of options: each annotated field is one. What a verb's first parameter is of."""
+
+    json_: bool = False
+    revision: int | None = None
+    accept: list[str] | None = None
+    """Of a set without such an option."""
+
+    def __init__(self, given: dict[str, Any]) -> None:
+        vars(self).update(given)
+
+    @classmethod
+    def parameters(cls) -> dict[str, inspect.Parameter]:
+        """{field: it, as a parameter of a verb}; the fields of a base follow its own."""
+        found: dict[str, Any] = {}
+        for kind in cls.__mro__[:-1]:
+            for name, hint in inspect.get_annotations(kind, eval_str=True).items():
+                found.setdefault(name, hint)
+        by_name = inspect.Parameter.KEYWORD_ONLY
+        return {
+            name: inspect.Parameter(name, by_name, default=getattr(cls, name), annotation=hint)
+            for name, hint in found.items()
+            if hasattr(hint, "__metadata__")
+        }
+
+
+class Asks(Options):
+    """Which daemon is asked."""
+
+    node: AskedOption = None
+    runtime_dir: RuntimeOption = None
+    connect: ConnectOption = None
+
+    def door(self) -> Door:
+        """To that daemon. Raises `CliError`: there is none."""
+        from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+
+        return find_door(self.runtime_dir, self.node, connect=self.connect)
+
+
+class Answers(Asks):
+    """How its answer is shown, too."""
+
+    json_: JsonOption = False
+
+
+class Consents(Answers):
+    """What every verb takes that changes something."""
+
+    plan: PlanOption = False
+    yes: YesOption = False
+    reason: ReasonOption = ""
+
+    def order(self, for_: str | None = None) -> OrderView:
+        """An order; ``for_``: how long it holds. Raises `CliError`: that is no time, or no daemon is there."""
+        from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
+        from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
+
+        return OrderView(
+            door=self.door(),
+            is_json=self.json_,
+            is_yes=self.yes,
+            is_plan=self.plan,
+            reason=self.reason,
+            revision=self.revision,
+            for_s=None if for_ is None else duration_s(for_),
+        )
+
+    def change(self, *words: str, pause_after: int | None = None, is_data: bool = False) -> ApplyView:
+        """A change of the document; ``words``: the verb with its arguments, for the fleet's history."""
+        from zsched.commands.apply import ApplyView  # noqa: PLC0415 - as above
+
+        return ApplyView(
+            words=words,
+            is_plan=self.plan,
+            is_sure=self.yes,
+            is_json=self.json_,
+            accepted=tuple(self.accept or ()),
+            revision=self.revision,
+            reason=self.reason,
+            is_data=is_data,
+            pause_after=pause_after,
+        )
+
+
+class Orders(Consents):
+    """What an order takes that the fleet agrees."""
+
+    revision: RevisionOption = None
+
+
+class Changes(Orders):
+    """What a change takes that may be dangerous."""
+
+    accept: AcceptOption = None
+
+
+class Edits(Changes):
+    """The same where stdout is for something else."""
+
+    json_: bool = False
+
+
+class Files(Options):
+    """Where this machine's files are."""
+
+    config: ConfigOption = None
+    state_dir: StateOption = None
+
+    def places(self) -> Places:
+        """The same, with what stands in for what is not given."""
+        from zsched import paths  # noqa: PLC0415 - as above
+        from zsched.runtime.membership import Places  # noqa: PLC0415 - as above
+
+        return Places(
+            config=paths.config_path(self.config, os.environ), state=paths.state_folder(self.state_dir, os.environ)
+        )
+
+
+class Here(Files):
+    """Which node this machine is, too."""
+
+    node: NameOption = None
+
+
+class Machine(Here):
+    """Where its daemon listens, too."""
+
+    runtime_dir: RuntimeOption = None
+
+    def machine(self) -> doctor.Machine:
+        """The same for the doctor. Raises `CliError` (2): the node's name is none."""
+        from zsched.commands.doctor import machine_of  # noqa: PLC0415 - as above
+        from zsched.commands.here import own_name  # noqa: PLC0415 - as above
+
+        own_name(self.node)
+        return machine_of(self.config, self.node, self.state_dir, self.runtime_dir)
+
+
+class _Spread:
+    """A verb as typer sees it: where its first parameter is a set of options, each of these is one of its own."""
+
+    def __init__(self, verb: Callable[..., None]) -> None:
+        functools.update_wrapper(self, verb)
+        self._verb = verb
+
+    @functools.cached_property
+    def _set(self) -> tuple[str, type[Options], dict[str, inspect.Parameter]] | None:
+        """(the parameter's name, its set, the options)."""
+        first = next(iter(inspect.signature(self._verb, eval_str=True).parameters.values()))
+        kind = first.annotation
+        is_set = isinstance(kind, type) and issubclass(kind, Options)
+        return (first.name, kind, kind.parameters()) if is_set else None
+
+    @functools.cached_property
+    def __signature__(self) -> inspect.Signature:
+        """Made when it is asked for: of one verb, where one is named."""
+        whole = inspect.signature(self._verb, eval_str=True)
+        if self._set is None:
+            return whole
+        return whole.replace(parameters=[*list(whole.parameters.values())[1:], *self._set[2].values()])
+
+    def __call__(self, **given: Any) -> None:
+        """Run it."""
+        if self._set is not None:
+            name, kind, options = self._set
+            given[name] = kind({option: given.pop(option) for option in options})
+        self._verb(**given)
+
+
+def add_verb(app: typer.Typer, verb: Callable[..., None], name: str | None = None, *, is_hidden: bool = False) -> None:
+    """Make a function a verb of ``app``."""
+    app.command(name, cls=Verb, hidden=is_hidden)(_Spread(verb))
+
+
+def new_group(name: str, about: str, verbs: dict[str, Callable[..., None]]) -> typer.Typer:
+    """A verb with verbs below it, by their names; ``about``: what its help says."""
+    group = typer.Typer(name=name, cls=Verbs, help=about, no_args_is_help=True, rich_markup_mode=None)
+    for below, verb in verbs.items():
+        add_verb(group, verb, below)
+    return group

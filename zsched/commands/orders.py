@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import os
 import pwd
-import shlex
 import socket
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 from zsched.commands.ask import Door, operator_at
-from zsched.commands.common import CliError, Json, check_reason, nearest, print_json, say, says_yes, warn
+from zsched.commands.common import CliError, Json, again, check_reason, nearest, print_json, say, says_yes, warn
 from zsched.commands.document import CODES, ask_all, told_refusal
 from zsched.commands.page import span
 from zsched.core.values.model import MAX_FOR_S
@@ -179,8 +178,7 @@ def check_can_ask(view: OrderView, told: str = "") -> None:
     """
     if view.is_yes or (sys.stdin.isatty() and not view.is_json):
         return
-    command = shlex.join(["zsched", *sys.argv[1:], "--yes"])
-    raise CliError(EXIT_USAGE, f"{told}nothing was done, for nobody can be asked here; to do it:\n{command}")
+    raise CliError(EXIT_USAGE, f"{told}nothing was done, for nobody can be asked here; to do it:\n{again('--yes')}")
 
 
 def show_rows(titles: Row, rows: Sequence[Row]) -> None:

@@ -6,21 +6,15 @@ Knows: options. Does not know: how anything is done (`zsched.commands.pki`, impo
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsched.commands.common import Verb, Verbs
-from zsched.commands.options import AskedOption, ConfigOption, RuntimeOption
+from zsched.commands.options import AskedOption, ConfigOption, JsonOption, Options, RuntimeOption, new_group
 from zsched.core.values.certificates import Role
 
-pki_app = typer.Typer(
-    name="pki",
-    cls=Verbs,
-    help="The fleet's authority and its certificates.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+if TYPE_CHECKING:
+    from zsched.commands.pki import Where
 
 AuthorityOption = Annotated[
     Path | None,
@@ -34,10 +28,21 @@ OutOption = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", he
 LabelArgument = Annotated[str, typer.Argument(metavar="NAME", help="As `zsched pki show` names it: robot1, robot1.k2.")]
 
 
-@pki_app.command(cls=Verb)
+class Authority(Options):
+    """Which authority is meant, and of which fleet."""
+
+    config: ConfigOption = None
+    authority: AuthorityOption = None
+
+    def where(self) -> Where:
+        """The same, as `zsched.commands.pki` takes it."""
+        from zsched.commands.pki import Where  # noqa: PLC0415 - each verb imports what it needs
+
+        return Where(config=self.config, authority=self.authority)
+
+
 def init(
-    config: ConfigOption = None,
-    authority: AuthorityOption = None,
+    where: Authority,
     passphrase: Annotated[
         bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
     ] = False,
@@ -52,18 +57,15 @@ def init(
     """
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
-    where = pki.Where(config=config, authority=authority)
-    raise typer.Exit(pki.init(where, asks_passphrase=passphrase, accepted=accept or ()))
+    raise typer.Exit(pki.init(where.where(), asks_passphrase=passphrase, accepted=accept or ()))
 
 
-@pki_app.command(cls=Verb)
 def issue(
+    where: Authority,
     name: Annotated[str, typer.Argument(metavar="NAME", help="A node of the fleet file, or a person or tool.")],
     role: Annotated[Role, typer.Option("--role", help="What NAME is.")] = Role.NODE,
     csr: RequestOption = None,
     out: OutOption = None,
-    config: ConfigOption = None,
-    authority: AuthorityOption = None,
 ) -> None:
     """Make the key and the first certificate of a node, an operator or a guest; it lasts 30 days.
 
@@ -72,23 +74,21 @@ def issue(
     """
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(pki.issue(pki.Where(config=config, authority=authority), name, role, csr, out))
+    raise typer.Exit(pki.issue(where.where(), name, role, csr, out))
 
 
-@pki_app.command(cls=Verb)
 def show(
-    config: ConfigOption = None,
-    authority: AuthorityOption = None,
-    json_: Annotated[bool, typer.Option("--json", help="JSON, with its schema; --json=1: of that version.")] = False,
+    where: Authority,
+    json_: JsonOption = False,
 ) -> None:
     """List every key that was certified: until when, and whether it is due, revoked or ended."""
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(pki.show(pki.Where(config=config, authority=authority), is_json=json_))
+    raise typer.Exit(pki.show(where.where(), is_json=json_))
 
 
-@pki_app.command(cls=Verb)
 def renew(
+    where: Authority,
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one. [all that are due]")] = None,
     csr: RequestOption = None,
     out: OutOption = None,
@@ -97,8 +97,6 @@ def renew(
     ] = False,
     node: AskedOption = None,
     runtime_dir: RuntimeOption = None,
-    config: ConfigOption = None,
-    authority: AuthorityOption = None,
 ) -> None:
     """Make new certificates for keys that have one. A certificate is due after two thirds of its life.
 
@@ -113,25 +111,29 @@ def renew(
 
         if csr is not None or out is not None:
             raise CliError(EXIT_USAGE, "--csr and --out go without --deliver")
-        raise typer.Exit(pki.deliver(pki.Where(config=config, authority=authority), find_door(runtime_dir, node), name))
-    raise typer.Exit(pki.renew(pki.Where(config=config, authority=authority), name, csr, out))
+        raise typer.Exit(pki.deliver(where.where(), find_door(runtime_dir, node), name))
+    raise typer.Exit(pki.renew(where.where(), name, csr, out))
 
 
-@pki_app.command(cls=Verb)
-def revoke(name: LabelArgument, config: ConfigOption = None, authority: AuthorityOption = None) -> None:
+def revoke(where: Authority, name: LabelArgument) -> None:
     """Never certify a key again, and say which line of the fleet file keeps it out."""
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(pki.revoke(pki.Where(config=config, authority=authority), name))
+    raise typer.Exit(pki.revoke(where.where(), name))
 
 
-@pki_app.command(cls=Verb)
 def rotate(
+    where: Authority,
     finish: Annotated[bool, typer.Option("--finish", help="Stop trusting the former authority.")] = False,
-    config: ConfigOption = None,
-    authority: AuthorityOption = None,
 ) -> None:
     """Begin with a new authority. Both are trusted until --finish, which waits for every certificate to be renewed."""
     from zsched.commands import pki  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(pki.rotate(pki.Where(config=config, authority=authority), is_end=finish))
+    raise typer.Exit(pki.rotate(where.where(), is_end=finish))
+
+
+GROUP = new_group(
+    "pki",
+    "The fleet's authority and its certificates.",
+    {"init": init, "issue": issue, "show": show, "renew": renew, "revoke": revoke, "rotate": rotate},
+)

@@ -10,24 +10,27 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Verb, Verbs
-from zsched.commands.options import AskedOption, ConnectOption, HereOption, JsonOption, RuntimeOption
-from zsched.exits import EXIT_USAGE
-
-metrics_app = typer.Typer(
-    name="metrics", cls=Verbs, help="Figures for Prometheus.", no_args_is_help=True, rich_markup_mode=None
+from zsched.commands.common import CliError
+from zsched.commands.options import (
+    AgeOption,
+    Answers,
+    Asks,
+    HereOption,
+    JsonOption,
+    NoColorOption,
+    RuntimeOption,
+    TaskArgument,
+    new_group,
 )
+from zsched.exits import EXIT_USAGE
 
 
 def status(
-    json_: JsonOption = False,
+    asked: Answers,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
     interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+    no_color: NoColorOption = False,
 ) -> None:
     """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
 
@@ -35,13 +38,11 @@ def status(
     """
     from zsched.commands.status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
 
-    view = StatusView(
-        runtime_dir=runtime_dir, node=node, is_json=json_, is_plain=no_color, is_whole=verbose, connect=connect
-    )
+    view = StatusView(door=asked.door(), is_json=asked.json_, is_plain=no_color, is_whole=verbose)
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
 
 
-def site(json_: JsonOption = False, node: AskedOption = None, runtime_dir: RuntimeOption = None) -> None:
+def site(json_: JsonOption = False, node: HereOption = None, runtime_dir: RuntimeOption = None) -> None:
     """Ask every fleet of the site how it is: nodes alive, tasks and their owners.
 
     The fleets are those under `site:` in the document, or in the fleet file. `--node CELL/NODE` of the other verbs
@@ -53,7 +54,8 @@ def site(json_: JsonOption = False, node: AskedOption = None, runtime_dir: Runti
 
 
 def explain(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    asked: Answers,
+    task: TaskArgument,
     plan: Annotated[
         str | None, typer.Option("--plan", metavar="NODE=down", help="Reckon again without that node; 10: it moves.")
     ] = None,
@@ -64,27 +66,23 @@ def explain(
     robot: Annotated[
         str | None, typer.Option("--robot", metavar="NAME", help="Only what this robot sees: its terms, whom it hears.")
     ] = None,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+    no_color: NoColorOption = False,
 ) -> None:
     """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
 
     On an edge, which decides nothing, a robot is asked in its place. With --at 12 it shows the judgement that came
     before the move to epoch 12, and that move; with an age or a time, the one of that moment.
     """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.common import wants_color  # noqa: PLC0415 - as above
+    from zsched.commands.common import wants_color  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.explain import ExplainView  # noqa: PLC0415 - as above
     from zsched.commands.explain import explain as ask_why  # noqa: PLC0415 - as above
 
-    view = ExplainView(plan=plan, at=at, robot=robot, is_json=json_, is_colored=wants_color(no_color))
-    raise typer.Exit(ask_why(find_door(runtime_dir, node, connect=connect), task, view))
+    view = ExplainView(plan=plan, at=at, robot=robot, is_json=asked.json_, is_colored=wants_color(no_color))
+    raise typer.Exit(ask_why(asked.door(), task, view))
 
 
 def history(
+    asked: Answers,
     task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only what was done to it.")] = None,
     about: Annotated[
         str | None,
@@ -92,12 +90,8 @@ def history(
             "--for", metavar="node/NAME", help="Only moves to this node or away from it, and orders that name it."
         ),
     ] = None,
-    since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
+    since: AgeOption = None,
     site: Annotated[bool, typer.Option("--site", help="Of every fleet of the site, merged by age.")] = False,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Show every change of owner in a node's decision log: when, from where to where, why, and who voted for it.
 
@@ -106,8 +100,7 @@ def history(
     With --site one node of each fleet of the site is asked. A fleet that does not answer is named, and the others are
     shown; exits with 3 when none answers.
     """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.history import Past, duration_s, subject_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import Past, duration_s, subject_of  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.history import history as show_moves  # noqa: PLC0415 - as above
 
     of_task, of_node = (None, None) if about is None else subject_of(about)
@@ -117,17 +110,16 @@ def history(
     if site:
         from zsched.commands.cells import show_histories  # noqa: PLC0415 - as above
 
-        if connect is not None or (node is not None and "/" in node):
+        if asked.connect is not None or (asked.node is not None and "/" in asked.node):
             raise CliError(EXIT_USAGE, "--site asks every cell; leave out --connect and CELL/NODE")
         past = Past(task=task or of_task, about=of_node, since_s=since_s)
-        raise typer.Exit(show_histories(runtime_dir, node, past, is_json=json_))
-    door = find_door(runtime_dir, node, connect=connect)
-    raise typer.Exit(show_moves(door, task or of_task, about=of_node, since_s=since_s, is_json=json_))
+        raise typer.Exit(show_histories(asked.runtime_dir, asked.node, past, is_json=asked.json_))
+    raise typer.Exit(show_moves(asked.door(), task or of_task, about=of_node, since_s=since_s, is_json=asked.json_))
 
 
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
-    since: Annotated[str | None, typer.Option("--since", metavar="AGE", help="Not older: 90s, 10m, 2h, 1d.")] = None,
+    since: AgeOption = None,
     about: Annotated[
         str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
     ] = None,
@@ -166,21 +158,14 @@ def replay(
 
 
 def wait(
+    asked: Answers,
     condition: Annotated[
         str,
-        typer.Option(
-            "--for",
-            metavar="CONDITION",
-            help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE.",
-        ),
+        typer.Option("--for", metavar="CONDITION", help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE."),
     ],
     timeout: Annotated[
         float, typer.Option("--timeout", min=0.0, max=86400.0, metavar="S", help="Seconds; 0: look once.")
     ] = 30.0,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Wait until a condition holds; say what is missing if it does not in time.
 
@@ -188,24 +173,19 @@ def wait(
     """
     from zsched.commands.wait import WaitView, wait_for  # noqa: PLC0415 - each verb imports what it needs
 
-    view = WaitView(runtime_dir=runtime_dir, node=node, connect=connect, timeout_s=timeout, is_json=json_)
-    raise typer.Exit(wait_for(view, condition))
+    raise typer.Exit(wait_for(WaitView(find=asked.door, timeout_s=timeout, is_json=asked.json_), condition))
 
 
-@metrics_app.command("print", cls=Verb)
-def metrics_print(node: AskedOption = None, runtime_dir: RuntimeOption = None, connect: ConnectOption = None) -> None:
+def metrics_print(asked: Asks) -> None:
     """Print a node's figures in Prometheus' text format."""
     from zsched.commands.metrics import print_metrics  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(print_metrics(runtime_dir, node, connect))
+    raise typer.Exit(print_metrics(asked.door))
 
 
-@metrics_app.command("write", cls=Verb)
 def metrics_write(
+    asked: Asks,
     path: Annotated[Path, typer.Argument(metavar="PATH", help="As /var/lib/node_exporter/zsched.prom.")],
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Write them to a file, whole or not at all, for node_exporter's textfile collector.
 
@@ -213,21 +193,18 @@ def metrics_write(
     """
     from zsched.commands.metrics import write_metrics  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(write_metrics(path, runtime_dir, node, connect))
+    raise typer.Exit(write_metrics(path, asked.door))
 
 
 def logs(
-    task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet file.")],
+    asked: Answers,
+    task: TaskArgument,
     whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Also what it prints from now on.")] = False,
     lines: Annotated[int, typer.Option("--lines", min=0, max=400, metavar="N", help="The newest N.")] = 100,
     level: Annotated[
         str | None, typer.Option("--level", metavar="LEVEL", help="At least: debug, info, warning, error, critical.")
     ] = None,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Show what a task's worker has printed lately, on whichever node it runs.
 
@@ -235,13 +212,8 @@ def logs(
     """
     from zsched.commands.logs import LogsView, show_logs  # noqa: PLC0415 - each verb imports what it needs
 
-    view = LogsView(
-        runtime_dir=runtime_dir,
-        node=node,
-        connect=connect,
-        is_json=json_,
-        is_followed=follow,
-        most=lines,
-        level=level,
-    )
+    view = LogsView(door=asked.door(), is_json=asked.json_, is_followed=follow, most=lines, level=level)
     raise typer.Exit(show_logs(view, task, whose))
+
+
+METRICS = new_group("metrics", "Figures for Prometheus.", {"print": metrics_print, "write": metrics_write})

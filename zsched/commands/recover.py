@@ -7,13 +7,12 @@ Knows: tables, dangers that are accepted by name, what comes next. Does not know
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from zsched import paths as places
-from zsched.commands.common import CliError, check_dangers, say, says_yes, warn
+from zsched.commands.common import CliError, again, check_dangers, say, says_yes, warn
 from zsched.commands.here import own_name
 from zsched.commands.orders import user_name
 from zsched.config.load import load_fleet, require_node
@@ -48,25 +47,12 @@ def place_of(config: Path | None, node: str | None, state_dir: Path | None) -> P
     return Place(fleet=fleet, node=name, config=file, folder=places.state_folder(state_dir, os.environ))
 
 
-def words_of(config: Path | None, node: str | None, state_dir: Path | None) -> list[str]:
-    """The options that name a node and its files, as they were given."""
-    given = (("--config", config), ("--node", node), ("--state-dir", state_dir))
-    return [part for name, value in given if value is not None for part in (name, str(value))]
-
-
 class Manner(Struct, frozen=True, kw_only=True):
     """How it is shown and confirmed."""
 
-    words: tuple[str, ...]
-    """The command as it was given, without what follows here."""
     is_plan: bool = False
     is_sure: bool = False
     accepted: tuple[str, ...] = ()
-
-    def again(self, *more: str) -> str:
-        """The command, with more words."""
-        kept = [part for name in self.accepted for part in ("--accept", name)]
-        return shlex.join(("zsched", *self.words, *kept, *more))
 
 
 def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
@@ -88,7 +74,7 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
     if missing:
         names = [part for danger, _ in missing for part in ("--accept", danger.value)]
         lines = "\n".join(f"  {danger.value}: {means}" for danger, means in missing)
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{manner.again(*names)}")
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again(*names)}")
     _confirm(manner, f"Make {place.node} the only elector of a new generation of {place.fleet.name}?")
     state = runtime.recover(plan, place.config, place.folder, brought)
     before, after = plan.before, _value_of(state)
@@ -137,7 +123,7 @@ def _confirm(manner: Manner, question: str) -> None:
     if manner.is_sure:
         return
     if not sys.stdin.isatty():
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{manner.again('--yes')}")
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{again('--yes')}")
     sys.stdout.flush()
     if not says_yes(question, sys.stderr):
         raise CliError(EXIT_FAILED, "nothing was changed")

@@ -11,12 +11,12 @@ from typing import Annotated
 import typer
 
 from zsched.commands.common import CliError
-from zsched.commands.options import AskedOption, JsonOption, PlanOption, RuntimeOption, YesOption
-from zsched.commands.order_verbs import ReasonOption, RevisionOption
+from zsched.commands.options import Orders
 from zsched.exits import EXIT_USAGE
 
 
 def rehearse(
+    said: Orders,
     task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task of the fleet file.")] = None,
     steps: Annotated[
         str, typer.Option(metavar="STEPS", help="What is done, in this order: move, drain, worker, daemon, link.")
@@ -31,16 +31,6 @@ def rehearse(
     ] = None,
     kept: Annotated[bool, typer.Option("--list", help="List the rehearsals that the node has kept.")] = False,
     show: Annotated[str | None, typer.Option(metavar="ID", help="Show one of them.")] = None,
-    reason: ReasonOption = "",
-    revision: RevisionOption = None,
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    json_: JsonOption = False,
-    node: AskedOption = None,
-    connect: Annotated[
-        str | None, typer.Option("--connect", metavar="ENDPOINT", help="Look through this node's control endpoint.")
-    ] = None,
-    runtime_dir: RuntimeOption = None,
 ) -> None:
     """Play faults on the running fleet, one at a time, and tell what it makes of them beside what is promised.
 
@@ -49,18 +39,14 @@ def rehearse(
     """
     from zsched import paths as places  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands import rehearse as verb  # noqa: PLC0415 - as above
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
-    from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
 
-    door = find_door(runtime_dir, node, connect=connect)
     if kept or show is not None:
         if task is not None:
             raise CliError(EXIT_USAGE, "--list and --show go without a task")
-        raise typer.Exit(verb.show_kept(door, show, is_json=json_))
+        raise typer.Exit(verb.show_kept(said.door(), show, is_json=said.json_))
     if task is None:
         raise CliError(EXIT_USAGE, "name a task, or --list: `zsched rehearse TASK`")
-    view = OrderView(door=door, is_json=json_, is_yes=yes, is_plan=plan, reason=reason, revision=revision)
     order = verb.RehearseOrder(
         task=task, steps=verb.parse_steps(steps), rounds=rounds, pause_s=pause, limit_s=limit, cut_s=cut
     )
-    raise typer.Exit(verb.rehearse(view, order, places.asked_folder(runtime_dir, os.environ)))
+    raise typer.Exit(verb.rehearse(said.order(), order, places.asked_folder(said.runtime_dir, os.environ)))

@@ -8,10 +8,9 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from pathlib import Path
 
 from zsched.clock import wall_ns
-from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, wants_color, warn
 from zsched.commands.report import TROUBLES, degradations, render_status
 from zsched.core.values.struct import Struct
@@ -27,19 +26,16 @@ CLEAR = "\x1b[2J"
 class StatusView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
-    runtime_dir: Path | None
-    node: str | None
+    door: Door
     is_json: bool
     is_plain: bool
-    connect: str | None = None
-    """A node's control endpoint, to be asked instead of a daemon here."""
     is_whole: bool = False
     """All six blocks, instead of a line per node and task."""
 
 
 def show(view: StatusView) -> int:
     """Print one status; returns the exit code."""
-    status = ask_status(find_door(view.runtime_dir, view.node, connect=view.connect))
+    status = ask_status(view.door)
     if view.is_json:
         print_json(_with_reasons(status))
     else:
@@ -55,8 +51,7 @@ def watch_on(view: StatusView, interval_s: float) -> int:
     Raises:
         CliError: already the first question found nobody.
     """
-    door = find_door(view.runtime_dir, view.node, connect=view.connect)
-    status: Json | CliError = ask_status(door)
+    status: Json | CliError = ask_status(view.door)
     is_screen = sys.stdout.isatty() and not view.is_json
     code = EXIT_OK
     try:
@@ -65,7 +60,7 @@ def watch_on(view: StatusView, interval_s: float) -> int:
             code = status.code if isinstance(status, CliError) else code_of(status)
             _print_next(view, status, is_screen=is_screen)
             time.sleep(interval_s)
-            status = _ask_again(door)
+            status = _ask_again(view.door)
     except KeyboardInterrupt:
         sys.stdout.write("\n" if is_screen else "")
         return code

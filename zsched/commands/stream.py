@@ -8,11 +8,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
 from zsched.commands.page import Page, counted, since_drop, size, span
 from zsched.core.route import keyexpr
@@ -35,12 +34,9 @@ KINDS: Final = {"in": "input", "out": "output", "srv": "service"}
 class StreamView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
-    runtime_dir: Path | None
-    node: str | None
+    door: Door
     is_json: bool
     window_s: float
-    connect: str | None = None
-    """`list` only: a node's control endpoint, to be asked instead of a daemon here."""
     count: int | None = None
     """How many windows (``tail``: samples) to show; ``None``: until Ctrl-C."""
     timeout_s: float | None = None
@@ -52,7 +48,7 @@ class StreamView(Struct, frozen=True, kw_only=True):
 
 def show_list(view: StreamView, key: str | None) -> int:
     """Print the node's streams with their rates over one window; returns the exit code."""
-    door = find_door(view.runtime_dir, view.node, connect=view.connect)
+    door = view.door
     first = ask_door(door, {"verb": "status"})
     started = monotonic_s()
     time.sleep(view.window_s)
@@ -342,7 +338,7 @@ def _tap(view: StreamView, word: str | None, kept_bytes: int = 0) -> StreamTap:
     Raises:
         CliError: no daemon (3), no way to the node's data (3), no such stream or key (1, 2), a node of a cell (2).
     """
-    door = find_door(view.runtime_dir, view.node)
+    door = view.door
     if door.cell is not None:
         raise CliError(EXIT_USAGE, "--node CELL/NODE: this verb joins the data network; ask on a machine of that fleet")
     keys = keys_for(ask_door(door, {"verb": "status"}), word)

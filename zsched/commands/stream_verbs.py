@@ -5,29 +5,16 @@ Knows: options. Does not know: how anything is done (`zsched.commands.stream`, i
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
+import contextlib
 from typing import Annotated
 
 import typer
 
-from zsched.commands.common import Verb, Verbs
-from zsched.commands.options import ConnectOption, JsonOption, RuntimeOption
-
-stream_app = typer.Typer(
-    name="stream",
-    cls=Verbs,
-    help="What flows where right now, for any node.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+from zsched.commands.options import Answers, AskedOption, JsonOption, Options, RuntimeOption, new_group
 
 KeyArgument = Annotated[
     str | None,
     typer.Argument(metavar="[KEY]", help="A stream (map_merge/in/0, in/0) or a key expression. [the robot's own keys]"),
-]
-NodeOption = Annotated[
-    str | None, typer.Option("--node", "-n", metavar="NAME", help="At this node, here or anywhere in the fleet.")
 ]
 WindowOption = Annotated[float, typer.Option("--window", min=0.1, max=3600.0, metavar="S", help="Seconds to look at.")]
 CountOption = Annotated[
@@ -35,91 +22,60 @@ CountOption = Annotated[
 ]
 
 
-@stream_app.command("list", cls=Verb)
-def list_(
-    key: KeyArgument = None,
-    node: NodeOption = None,
-    json_: JsonOption = False,
-    window: WindowOption = 2.0,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-) -> None:
+class Tap(Options):
+    """Where samples are listened to, how many, and how they are shown."""
+
+    json_: JsonOption = False
+    count: CountOption = None
+    node: AskedOption = None
+    runtime_dir: RuntimeOption = None
+
+    def run(self, verb: str, key: str | None, window: float = 1.0, timeout: float | None = None) -> None:
+        """Until there were enough, or Ctrl-C: that is how these verbs are meant to end."""
+        from zsched.commands import stream  # noqa: PLC0415 - each verb imports what it needs
+        from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
+
+        door, code = find_door(self.runtime_dir, self.node), 0
+        view = stream.StreamView(door=door, is_json=self.json_, window_s=window, count=self.count, timeout_s=timeout)
+        with contextlib.suppress(KeyboardInterrupt):
+            code = stream.show_tail(view, key) if verb == "tail" else stream.show_rates(view, key, verb)
+        raise typer.Exit(code)
+
+
+def list_(asked: Answers, key: KeyArgument = None, window: WindowOption = 2.0) -> None:
     """List a node's streams: from where to where, how fast, and what was dropped."""
     from zsched.commands.stream import StreamView, show_list  # noqa: PLC0415 - each verb imports what it needs
 
-    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=window, connect=connect)
-    raise typer.Exit(show_list(view, key))
+    raise typer.Exit(show_list(StreamView(door=asked.door(), is_json=asked.json_, window_s=window), key))
 
 
-@stream_app.command(cls=Verb)
-def hz(
-    key: KeyArgument = None,
-    node: NodeOption = None,
-    json_: JsonOption = False,
-    window: WindowOption = 2.0,
-    count: CountOption = None,
-    runtime_dir: RuntimeOption = None,
-) -> None:
+def hz(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> None:
     """Show how often something comes on each key, and the shortest and longest gap.
 
     Of a stream, both its ends are shown. Exits with 1 when nothing came in the last window.
     """
-    _rates("hz", key, node, json_=json_, window=window, count=count, runtime_dir=runtime_dir)
+    tap.run("hz", key, window)
 
 
-@stream_app.command(cls=Verb)
-def bw(
-    key: KeyArgument = None,
-    node: NodeOption = None,
-    json_: JsonOption = False,
-    window: WindowOption = 2.0,
-    count: CountOption = None,
-    runtime_dir: RuntimeOption = None,
-) -> None:
+def bw(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> None:
     """Show how many bytes per second come on each key, and the smallest and largest message."""
-    _rates("bw", key, node, json_=json_, window=window, count=count, runtime_dir=runtime_dir)
+    tap.run("bw", key, window)
 
 
-@stream_app.command(cls=Verb)
 def tail(
+    tap: Tap,
     key: KeyArgument = None,
-    node: NodeOption = None,
-    json_: JsonOption = False,
-    count: CountOption = None,
     timeout: Annotated[
         float | None, typer.Option("--timeout", min=0.1, metavar="S", help="End after S seconds. [go on until Ctrl-C]")
     ] = None,
-    runtime_dir: RuntimeOption = None,
 ) -> None:
     """Print every message as it comes: key, size, encoding, the first bytes.
 
     Exits with 1 when nothing came within the timeout.
     """
-    from zsched.commands.stream import StreamView, show_tail  # noqa: PLC0415 - each verb imports what it needs
-
-    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=1.0, count=count, timeout_s=timeout)
-    raise typer.Exit(_until_interrupted(lambda: show_tail(view, key)))
+    tap.run("tail", key, timeout=timeout)
 
 
-def _rates(
-    verb: str,
-    key: str | None,
-    node: str | None,
-    *,
-    json_: bool,
-    window: float,
-    count: int | None,
-    runtime_dir: Path | None,
-) -> None:
-    from zsched.commands.stream import StreamView, show_rates  # noqa: PLC0415 - each verb imports what it needs
-
-    view = StreamView(runtime_dir=runtime_dir, node=node, is_json=json_, window_s=window, count=count)
-    raise typer.Exit(_until_interrupted(lambda: show_rates(view, key, verb)))
-
-
-def _until_interrupted(work: Callable[[], int]) -> int:
-    """Ctrl-C is how these verbs are meant to end."""
-    try:
-        return work()
-    except KeyboardInterrupt:
-        return 0
+GROUP = new_group(
+    "stream", "What flows where right now, for any node.", {"list": list_, "hz": hz, "bw": bw, "tail": tail}
+)

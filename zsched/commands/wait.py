@@ -6,12 +6,11 @@ Knows: the conditions, what a status must say for each. Does not know: how a sta
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import ask_door, find_door
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task
 from zsched.commands.page import span
 from zsched.commands.report import all_problems
@@ -117,9 +116,7 @@ def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
 class WaitView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, for how long, and how to show the answer."""
 
-    runtime_dir: Path | None
-    node: str | None
-    connect: str | None
+    find: Callable[[], Door]
     timeout_s: float
     is_json: bool
 
@@ -152,7 +149,7 @@ def _look(view: WaitView, condition: Condition) -> list[str] | CliError:
         CliError: there is no such task or node (2).
     """
     try:
-        door = find_door(view.runtime_dir, view.node, connect=view.connect)
+        door = view.find()
         first = ask_door(door, {"verb": "status"})
         _check_names(first, condition)
         statuses = {str(first["node"]): first}

@@ -10,26 +10,24 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.options import AskedOption, ConnectOption, HereOption, RuntimeOption
+from zsched.commands.options import Asks, HereOption, NoColorOption, RuntimeOption
 
 
 def top(
+    asked: Asks,
     once: Annotated[bool, typer.Option("--once", help="Print one screen and exit, as status does.")] = False,
     interval: Annotated[float, typer.Option(min=0.2, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
-    no_color: Annotated[bool, typer.Option("--no-color", help="Plain text (also: NO_COLOR).")] = False,
+    no_color: NoColorOption = False,
 ) -> None:
     """Show the fleet on the full screen: nodes, utilities over time, streams, the last moves; q ends."""
     from zsched.commands.watch.screen import TopView  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.watch.screen import top as show  # noqa: PLC0415 - as above
 
-    view = TopView(runtime_dir=runtime_dir, node=node, connect=connect, is_plain=no_color, interval_s=interval)
-    raise typer.Exit(show(view, is_once=once))
+    raise typer.Exit(show(TopView(find=asked.door, is_plain=no_color, interval_s=interval), is_once=once))
 
 
 def web(
+    asked: Asks,
     listen: Annotated[
         str, typer.Option("--listen", metavar="ADDRESS:PORT", help="Where; beyond this machine only with a token.")
     ] = "127.0.0.1:7459",
@@ -41,9 +39,6 @@ def web(
         list[str] | None,
         typer.Option("--host", metavar="NAME", help="Browsers may call this server so, besides its addresses."),
     ] = None,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Serve a page that shows the fleet live, and Prometheus' figures under /metrics; it changes nothing.
 
@@ -52,18 +47,11 @@ def web(
     from zsched.commands.watch.web import WebView  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.watch.web import web as serve  # noqa: PLC0415 - as above
 
-    view = WebView(
-        runtime_dir=runtime_dir,
-        node=node,
-        connect=connect,
-        listen=listen,
-        token_file=token_file,
-        hosts=tuple(host or ()),
-    )
-    raise typer.Exit(serve(view))
+    raise typer.Exit(serve(WebView(find=asked.door, listen=listen, token_file=token_file, hosts=tuple(host or ()))))
 
 
 def record(
+    asked: Asks,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new file, as run.mcap.")],
     for_: Annotated[
         str | None, typer.Option("--for", metavar="DURATION", help="How long: 90s, 10m, 2h. [until Ctrl-C]")
@@ -79,9 +67,6 @@ def record(
         list[str] | None,
         typer.Option("--tf", metavar="KEY", help="The same of a key whose samples are frames (TFMessage, CDR)."),
     ] = None,
-    node: AskedOption = None,
-    runtime_dir: RuntimeOption = None,
-    connect: ConnectOption = None,
 ) -> None:
     """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps, tf.
 
@@ -92,9 +77,7 @@ def record(
     from zsched.commands.watch.record import record as write  # noqa: PLC0415 - as above
 
     view = RecordView(
-        runtime_dir=runtime_dir,
-        node=node,
-        connect=connect,
+        find=asked.door,
         file=output,
         interval_s=interval,
         for_s=None if for_ is None else duration_s(for_),
@@ -119,15 +102,11 @@ def trace(
 
     Needs the extra trace. Exits with 1 when the collector refused one.
     """
-    from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
     from zsched.commands.watch.trace import TraceView  # noqa: PLC0415 - as above
     from zsched.commands.watch.trace import trace as send  # noqa: PLC0415 - as above
 
-    view = TraceView(
-        runtime_dir=runtime_dir,
-        node=node,
-        url=otlp,
-        since_s=None if since is None else duration_s(since),
-        is_once=once,
-    )
+    since_s = None if since is None else duration_s(since)
+    view = TraceView(find=lambda: find_door(runtime_dir, node), url=otlp, since_s=since_s, is_once=once)
     raise typer.Exit(send(view))

@@ -330,7 +330,7 @@ def test_a_danger_is_accepted_by_its_name_only(node: Node, tmp_path: Path) -> No
     refused = run("apply", file, "--yes")
     assert refused.exit_code == 1
     assert "remove-task: merge: its worker stops, its streams end" in refused.stderr
-    assert f"zsched apply {file} --accept remove-task" in refused.stderr
+    assert f"zsched apply {file} --yes --accept remove-task" in refused.stderr
     assert node.changes == []
     unknown = run("apply", file, "--yes", "--accept", "remove-tasks")
     assert unknown.exit_code == 2

@@ -269,7 +269,7 @@ def test_at_the_deadline_the_leave_stays_in_force_and_says_what_it_waits_for(hal
     hall.seat_goes_after = 1e9
     late = run("--yes", "--deadline", "1s")
     assert (late.exit_code, hall.asked, left(hall.folder)) == (5, ["robot3 flags leave"], UNTOUCHED)
-    assert "it is an elector still: it waits for a spare; give `zsched leave` again" in late.stderr
+    assert "it is an elector still: it waits for a spare; give `zsched leave --yes --deadline 1s` again" in late.stderr
     assert "zsched undrain robot3" in late.stderr
     hall.seat_goes_after = 0
     assert run("--yes").exit_code == 0, "the same command goes on"
@@ -286,7 +286,8 @@ def test_the_command_to_give_again_has_the_options_that_were_given(hall: Hall, m
     ):
         monkeypatch.delenv(f"ZSCHED_{name}")
         options += [option, str(hall.folder / place)]
-    late = run(*options, "--yes", "--deadline", "1s")
+    options += ["--yes", "--deadline", "1s"]
+    late = run(*options)
     assert late.exit_code == 5
     assert f"give `{shlex.join(['zsched', 'leave', *options])}` again to go on" in late.stderr
 

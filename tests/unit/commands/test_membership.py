@@ -492,7 +492,7 @@ def test_an_invited_node_is_agreed_last_in_who_dials_whom_and_its_file_says_all(
     assert fleet.task("merge").candidates == ("robot1", "robot2", "robot3")
     assert fleet.node("robot2").listen_data == "tcp/0.0.0.0:7458"
     assert node.text.startswith(TEXT.partition("tasks:")[0]), "every other character stays"
-    assert node.changes[0]["reason"] == "invite robot2 --address 192.0.2.12 --candidate-for merge"
+    assert node.changes[0]["reason"] == "invite robot2"
     assert node.changes[0]["why"] == "more hands"
     assert "nodes.robot2" in result.stderr
     assert "next, on that machine: sudo zsched join robot2.invite" in result.stderr
@@ -685,9 +685,10 @@ class Screen(io.StringIO):
 
 @pytest.mark.usefixtures("node")
 def test_who_would_print_an_invitation_is_told_the_same_command_into_a_file(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["invite", "robot2", "--address", "192.0.2.12", "--authority", "stick"]
+    monkeypatch.setattr(sys, "argv", ["zsched", *words])
     with contextlib.redirect_stdout(Screen()), pytest.raises(SystemExit) as ended:
         app(words)
     assert ended.value.code == 2

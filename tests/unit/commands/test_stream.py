@@ -88,11 +88,10 @@ def test_a_word_that_cannot_be_listened_to_is_refused(word: str, code: int, said
     assert caught.value.code == code
 
 
-def test_a_node_of_a_cell_is_no_place_to_listen_from_here(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_of_a_cell_is_no_place_to_listen_from_here() -> None:
     """Its status came through the gateway, and then a socket "." was asked for its data."""
     cell = Cell(name="hall-b", gateways=("tcp/127.0.0.1:1",))
-    monkeypatch.setattr(stream_verb, "find_door", lambda *_given: Door(socket=Path(), endpoint="x", cell=cell))
-    view = StreamView(runtime_dir=None, node="hall-b/robot3", is_json=False, window_s=1.0)
+    view = StreamView(door=Door(socket=Path(), endpoint="x", cell=cell), is_json=False, window_s=1.0)
     with pytest.raises(CliError, match="CELL/NODE: this verb joins the data network") as caught:
         show_rates(view, None, "hz")
     assert caught.value.code == 2
@@ -146,7 +145,7 @@ def test_a_gap_of_one_key_counts_though_another_has_come_meanwhile(
                 yield SimpleNamespace(side="fleet", key=key, size=10, at=at)
 
     monkeypatch.setattr(stream_verb, "_tap", lambda _view, _word: Tap())
-    view = StreamView(runtime_dir=None, node=None, is_json=True, window_s=1.0, count=4)
+    view = StreamView(door=Door(socket=Path()), is_json=True, window_s=1.0, count=4)
     assert show_rates(view, None, "hz") == 0
     last = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert {one["key"]: one["max_gap_s"] for one in last["keys"]} == pytest.approx({"odom": 1.0, "scan": 3.0})
@@ -226,7 +225,7 @@ def test_the_manual_shows_every_verb() -> None:
 
 # --- JSON ------------------------------------------------------------------------------------------------------------
 
-VIEW = StreamView(runtime_dir=None, node=None, is_json=True, window_s=1.0)
+VIEW = StreamView(door=Door(socket=Path()), is_json=True, window_s=1.0)
 
 
 @pytest.mark.parametrize("verb", ["hz", "bw"])

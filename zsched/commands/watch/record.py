@@ -10,12 +10,12 @@ import contextlib
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 from zsched.clock import monotonic_s, wall_s
-from zsched.commands.ask import Door, ask_door, find_door
+from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import Away, CliError, Json, stopped_by_signal, warn
 from zsched.commands.page import size
 from zsched.commands.watch import tracks
@@ -37,9 +37,7 @@ LIBRARY: Final = "zsched"
 class RecordView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and what to write."""
 
-    runtime_dir: Path | None
-    node: str | None
-    connect: str | None
+    find: Callable[[], Door]
     file: Path
     interval_s: float
     for_s: float | None
@@ -61,12 +59,12 @@ def record(view: RecordView) -> int:
         for key in keys:
             if (fault := keyexpr.fault(key)) is not None:
                 raise CliError(EXIT_USAGE, f"{option}: {key!r} is no key expression: {fault}")
-        if keys and view.connect is not None:
-            raise CliError(EXIT_USAGE, f"{option} joins the data network of a daemon here; --connect only asks")
-    feed = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect))
+    feed = Feed(view.find)
     door = feed.door()
     if door.cell is not None and (view.maps or view.frames):
         raise CliError(EXIT_USAGE, "--map and --tf join the data network: record them on a machine of that fleet")
+    if door.endpoint and (view.maps or view.frames):
+        raise CliError(EXIT_USAGE, "--map and --tf join the data network of a daemon here; --connect only asks")
     first = feed.ask()
     if first.status is None:
         raise CliError(first.code, first.why)

@@ -16,12 +16,11 @@ import sys
 import termios
 import threading
 import tty
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from zsched.clock import wall_s
-from zsched.commands.ask import find_door
+from zsched.commands.ask import Door
 from zsched.commands.common import CliError, wants_color
 from zsched.commands.status import code_of
 from zsched.commands.watch.feed import Feed, News
@@ -45,9 +44,7 @@ KEYS: Final = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
 class TopView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, and how to show the answer."""
 
-    runtime_dir: Path | None
-    node: str | None
-    connect: str | None
+    find: Callable[[], Door]
     is_plain: bool
     interval_s: float
 
@@ -58,7 +55,7 @@ def top(view: TopView, *, is_once: bool) -> int:
     Raises:
         CliError: already the first question found nobody, or there is no terminal (2).
     """
-    feed, past = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect)), Past()
+    feed, past = Feed(view.find), Past()
     feed.door()
     first = feed.ask()
     if first.status is None:

@@ -9,13 +9,12 @@ import logging
 import re
 import secrets
 import sys
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from zsched.clock import wall_s
-from zsched.commands.ask import find_door
+from zsched.commands.ask import Door
 from zsched.commands.common import Away, CliError, stopped_by_signal, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.spans import Moves, Span, trace_id
@@ -36,8 +35,7 @@ MAX_WHY: Final = 160
 class TraceView(Struct, frozen=True, kw_only=True):
     """Whose log is read, and where spans go."""
 
-    runtime_dir: Path | None
-    node: str | None
+    find: Callable[[], Door]
     url: str
     """A collector, as http://127.0.0.1:4318."""
     since_s: float | None
@@ -55,9 +53,9 @@ def trace(view: TraceView) -> int:
     """
     if not _is_collector(view.url):
         raise CliError(EXIT_USAGE, f"--otlp {view.url}: no address of a collector; write it as http://HOST:4318")
-    feed = Feed(lambda: find_door(view.runtime_dir, view.node))
-    if feed.door().node is not None:
-        raise CliError(EXIT_USAGE, f"the log of {view.node} lies on its machine: ask there")
+    feed = Feed(view.find)
+    if (node := feed.door().node) is not None:
+        raise CliError(EXIT_USAGE, f"the log of {node} lies on its machine: ask there")
     news = feed.ask()
     if news.status is None:
         raise CliError(news.code, news.why)

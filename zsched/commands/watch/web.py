@@ -18,12 +18,13 @@ import os
 import queue
 import socket
 import threading
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import find_door
+from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, stopped_by_signal, warn
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.gate import EXPLAIN, FILES, HEADERS, LEAST_TOKEN, LIVE, METRICS, Asked, Gate, Refusal, Route
@@ -51,9 +52,7 @@ MOST_HEAD_BYTES: Final = 16384
 class WebView(Struct, frozen=True, kw_only=True):
     """Which daemon to ask, where to listen, and who may look."""
 
-    runtime_dir: Path | None
-    node: str | None
-    connect: str | None
+    find: Callable[[], Door]
     listen: str
     token_file: Path | None
     hosts: tuple[str, ...]
@@ -74,7 +73,7 @@ def web(view: WebView) -> int:
         raise CliError(
             EXIT_USAGE, f"--listen {view.listen} is open to other machines: give a token with --token-file FILE"
         )
-    feed = Feed(lambda: find_door(view.runtime_dir, view.node, connect=view.connect))
+    feed = Feed(view.find)
     try:
         feed.door()
     except CliError as error:

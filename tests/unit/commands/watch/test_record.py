@@ -17,7 +17,6 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands.ask import Door
-from zsched.commands.watch import record
 from zsched.commands.watch.tracks import FRAMES, GRID, JSON_SCHEMAS, of_entry, of_status, ros_keys, topic_of
 from zsched.core.values.fleet import Cell
 
@@ -155,7 +154,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(folder: Path, mo
     file = folder / "run.mcap"
     for words, code, text in (
         (("--map", "a//b"), 2, "is no key expression"),
-        (("--map", "a", "--connect", "tcp/127.0.0.1:1"), 2, "--map joins the data network"),
+        (("--map", "a", "--connect", "tcp/127.0.0.1:1"), 2, "--map and --tf join the data network"),
         (("--tf", "a//b"), 2, "--tf: 'a//b' is no key expression"),
         (("--tf", "a", "--connect", "tcp/127.0.0.1:1"), 2, "--connect only asks"),
         (("--for", "soon"), 2, "is no duration"),
@@ -165,7 +164,7 @@ def test_what_cannot_be_done_is_said_before_anything_is_written(folder: Path, mo
         assert (refused.exit_code, text in refused.stderr) == (code, True), refused.stderr
     cell = Door(socket=Path(), endpoint="x", cell=Cell(name="hall-b", gateways=("tcp/127.0.0.1:1",)))
     with monkeypatch.context() as patched:
-        patched.setattr(record, "find_door", lambda *_given, **_more: cell)
+        patched.setattr("zsched.commands.ask.find_door", lambda *_given, **_more: cell)
         refused = run("-o", file, "--node", "hall-b/robot3", "--map", "robot3/map")
     assert (refused.exit_code, "on a machine of that fleet" in refused.stderr) == (2, True), refused.stderr
     assert run("-o", folder / "none" / "x.mcap").exit_code == 1
