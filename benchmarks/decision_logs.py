@@ -6,7 +6,7 @@ by service.
 Every 5 to 25 s something happens, at random: a busy process in an edge's share, a daemon that is killed or stopped and
 started again, one that stands still for seconds, or an operator's order by the real command (move, pin, pause, tune,
 drain, and what ends them). Meanwhile every line of every node's decision log is copied before its
-file is replaced. At the end ``zsched replay`` makes the judgements of each copy again, in a process of its own.
+file is replaced. At the end ``zsched explain --replay`` judges each copy again, in a process of its own.
 
 The exit code is 1 when one judgement comes out differently, or when a log has fewer lines than were read.
 """
@@ -227,8 +227,8 @@ def run(bed: Testbed, copies: Copies, seconds: float, seed: int) -> Disturbance:
 
 
 def replay(file: Path) -> Json:
-    """What ``zsched replay --json`` says of one log."""
-    done = subprocess.run([*CLI, "replay", str(file), "--json"], capture_output=True, check=False)
+    """What ``zsched explain --replay --json`` says of one log."""
+    done = subprocess.run([*CLI, "explain", "--replay", str(file), "--json"], capture_output=True, check=False)
     if not done.stdout:
         return {"judged": 0, "equal": False, "said": done.stderr.decode(errors="replace").strip()}
     said: Json = json.loads(done.stdout)

@@ -81,8 +81,8 @@ UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 GROUPS = (stream.GROUP, member.FLEET, fleet.TASK, fleet.NODE, pki.GROUP, question.METRICS)
 VERBS: tuple[Callable[..., None], ...] = (
     *(daemon.up, daemon.init, daemon.recover, daemon.rejoin, daemon.dev),
-    *(question.status, question.site, watch.top, watch.web, watch.record, watch.trace),
-    *(question.explain, question.history, question.events, question.replay),
+    *(question.status, watch.top, watch.web, watch.record, watch.trace),
+    *(question.explain, question.history, question.events),
     *(order.move, order.pin, order.unpin, order.pause, order.resume, order.tune),
     *(order.restart, order.drain, order.undrain),
     *(member.invite, member.join, member.leave, rehearse),

@@ -85,7 +85,7 @@ def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(s
         assert (status["fleet"], status["node"]) == (B, node)
     assert here.json("status", "--node", f"{A}/edge2")["fleet"] == A
     assert here.json("explain", TASK, "--node", f"{B}/robot1")["node"] == "robot1"
-    listed = here.json("site")
+    listed = here.json("status", "--site")
     assert [(cell["name"], cell["alive"], cell["nodes"]) for cell in listed["cells"]] == [(A, 3, 3), (B, 3, 3)]
 
     done = here.zsched("pause", TASK, "--node", f"{B}/robot1", "-m", "lens", "--yes")
@@ -116,7 +116,7 @@ def test_a_node_of_one_cell_asks_and_commands_the_other_while_its_gateways_die(s
     assert refused.returncode == 3
     assert f"{B}/robot1 cannot be asked" in refused.stderr
     assert all(f"by {gateway}" in refused.stderr for gateway in here.bed.fleet.cells[0].gateways)
-    listed = here.json("site")["cells"]
+    listed = here.json("status", "--site")["cells"]
     assert [(cell["name"], cell["error"] is None) for cell in listed] == [(A, True), (B, False)]
     done = here.zsched("history", "--site")
     assert done.returncode == 0, done.stderr

@@ -411,13 +411,13 @@ def test_a_move_is_explained_remembered_and_judged_again(tmp_path: Path) -> None
         robot.wait_owner()
         kept = json.loads(robot.zsched("history", "--json").stdout)["moves"]
         assert kept[: len(moves)] == [{**move, "age_s": old["age_s"]} for move, old in zip(moves, kept, strict=False)]
-        again = robot.zsched("replay", str(robot.state / "decisions.ndjson"))
+        again = robot.zsched("explain", "--replay", str(robot.state / "decisions.ndjson"))
         assert again.returncode == 0, again.stdout
         assert int(again.stdout.split(" ")[0]) >= 3
         changed = tmp_path / "changed.ndjson"
         text = (robot.state / "decisions.ndjson").read_text()
         assert '"spent":0.0' not in text, "defaults are left out"
         changed.write_text(text.replace('"outcome":"propose"', '"outcome":"stay"', 1))
-        differs = robot.zsched("replay", str(changed))
+        differs = robot.zsched("explain", "--replay", str(changed))
         assert differs.returncode == 1
         assert "and again" in differs.stdout

@@ -99,7 +99,7 @@ def gathered(scene: Scene, journal: Journal | None = None) -> Iterator[Member]:
 
 
 def _decision_logs(folder: Path, secrets: tuple[str, ...]) -> Iterator[Member]:
-    """This machine's decision log, for `zsched replay`; the older of its two files is there once one was full."""
+    """This machine's decision log, for `zsched explain --replay`; an older file is there once one was full."""
     for name in NAMES:
         try:
             text = read_regular(folder / name, 2 * FILE_BYTES, is_own=True).decode("utf-8", errors="replace")

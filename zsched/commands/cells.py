@@ -1,4 +1,4 @@
-"""`zsched site` and `zsched history --site`: ask every fleet of the site, each at its own gateways.
+"""`zsched status --site` and `zsched history --site`: ask every fleet of the site, each at its own gateways.
 
 Knows: which fleets there are, by the fleet file; exit codes. Does not know: sessions (`zsched.commands.ask`).
 """

@@ -27,6 +27,8 @@ INSTEAD: Final = {
     "retry": "zsched restart TASK NODE",
     **dict.fromkeys(("completion", "man"), "zsched install, which brings it"),
     "eligible": "zsched drain NODE --only new, or zsched undrain NODE",
+    "replay": "zsched explain --replay FILE",
+    "site": "zsched status --site",
     "maint": "zsched status, which tells every order",
     "remove": "zsched node remove NODE, or zsched task remove TASK",
 }

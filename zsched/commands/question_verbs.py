@@ -16,7 +16,6 @@ from zsched.commands.options import (
     Answers,
     Asks,
     HereOption,
-    JsonOption,
     NoColorOption,
     RuntimeOption,
     TaskArgument,
@@ -30,32 +29,29 @@ def status(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
     interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    site: Annotated[bool, typer.Option("--site", help="A line for each fleet of the site, with --json only.")] = False,
     no_color: NoColorOption = False,
 ) -> None:
     """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
 
-    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner.
+    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner. With --site it asks the fleets
+    under `site:` in the document, or in the fleet file, and one that does not answer is degraded, too.
     """
+    if site:
+        from zsched.commands.cells import show_site  # noqa: PLC0415 - each verb imports what it needs
+
+        if verbose or watch:
+            raise CliError(EXIT_USAGE, "--site shows a line for each fleet; leave out -v and --watch")
+        raise typer.Exit(show_site(*_of_site(asked), is_json=asked.json_))
     from zsched.commands.status import StatusView, show, watch_on  # noqa: PLC0415 - each verb imports what it needs
 
     view = StatusView(door=asked.door(), is_json=asked.json_, is_plain=no_color, is_whole=verbose)
     raise typer.Exit(watch_on(view, interval) if watch else show(view))
 
 
-def site(json_: JsonOption = False, node: HereOption = None, runtime_dir: RuntimeOption = None) -> None:
-    """Ask every fleet of the site how it is: nodes alive, tasks and their owners.
-
-    The fleets are those under `site:` in the document, or in the fleet file. `--node CELL/NODE` of the other verbs
-    asks a node of one of them. Exits with 4 when a cell does not answer or is degraded, with 3 when none answers.
-    """
-    from zsched.commands.cells import show_site  # noqa: PLC0415 - each verb imports what it needs
-
-    raise typer.Exit(show_site(runtime_dir, node, is_json=json_))
-
-
 def explain(
     asked: Answers,
-    task: TaskArgument,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; not with --replay.")] = None,
     plan: Annotated[
         str | None, typer.Option("--plan", metavar="NODE=down", help="Reckon again without that node; 10: it moves.")
     ] = None,
@@ -66,6 +62,10 @@ def explain(
     robot: Annotated[
         str | None, typer.Option("--robot", metavar="NAME", help="Only what this robot sees: its terms, whom it hears.")
     ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option("--replay", metavar="FILE", help="Judge all of a decision log again (also .gz); 1: one differs."),
+    ] = None,
     no_color: NoColorOption = False,
 ) -> None:
     """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
@@ -73,7 +73,14 @@ def explain(
     On an edge, which decides nothing, a robot is asked in its place. With --at 12 it shows the judgement that came
     before the move to epoch 12, and that move; with an age or a time, the one of that moment.
     """
-    from zsched.commands.common import wants_color  # noqa: PLC0415 - each verb imports what it needs
+    if (task is None) == (replay is None):
+        raise CliError(EXIT_USAGE, "name a task, or a decision log with --replay FILE")
+    if replay is not None:
+        from zsched.commands.replay import replay as make_again  # noqa: PLC0415 - each verb imports what it needs
+
+        raise typer.Exit(make_again(replay, is_json=asked.json_))
+    assert task is not None
+    from zsched.commands.common import wants_color  # noqa: PLC0415 - as above
     from zsched.commands.explain import ExplainView  # noqa: PLC0415 - as above
     from zsched.commands.explain import explain as ask_why  # noqa: PLC0415 - as above
 
@@ -110,11 +117,16 @@ def history(
     if site:
         from zsched.commands.cells import show_histories  # noqa: PLC0415 - as above
 
-        if asked.connect is not None or (asked.node is not None and "/" in asked.node):
-            raise CliError(EXIT_USAGE, "--site asks every cell; leave out --connect and CELL/NODE")
         past = Past(task=task or of_task, about=of_node, since_s=since_s)
-        raise typer.Exit(show_histories(asked.runtime_dir, asked.node, past, is_json=asked.json_))
+        raise typer.Exit(show_histories(*_of_site(asked), past, is_json=asked.json_))
     raise typer.Exit(show_moves(asked.door(), task or of_task, about=of_node, since_s=since_s, is_json=asked.json_))
+
+
+def _of_site(asked: Asks) -> tuple[Path | None, str | None]:
+    """(folder of sockets, node) of the daemon here, which knows the cells. Raises `CliError`: another one is meant."""
+    if asked.connect is not None or "/" in (asked.node or ""):
+        raise CliError(EXIT_USAGE, "--site asks every cell; leave out --connect and CELL/NODE")
+    return asked.runtime_dir, asked.node
 
 
 def events(
@@ -145,16 +157,6 @@ def events(
         is_json=json_,
     )
     raise typer.Exit(show_events(find_door(runtime_dir, node), view))
-
-
-def replay(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A decision log; may be packed (.gz).")],
-    json_: JsonOption = False,
-) -> None:
-    """Make every judgement of a decision log again from its figures; exits with 1 at the first that differs."""
-    from zsched.commands.replay import replay as make_again  # noqa: PLC0415 - each verb imports what it needs
-
-    raise typer.Exit(make_again(file, is_json=json_))
 
 
 def wait(

@@ -1,4 +1,4 @@
-"""`zsched replay FILE`: makes every judgement of a decision log again, and compares it with what was decided.
+"""`zsched explain --replay FILE`: makes every judgement of a decision log again, and compares it with what was decided.
 
 Knows: lines of a log, exit codes. Does not know: how a judgement is made (`zsched.core.scheduler.decision`).
 """

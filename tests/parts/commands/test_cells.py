@@ -1,4 +1,4 @@
-"""`--node CELL/NODE` and `zsched site` where there is no such cell, nobody answers, or the machine has no daemon."""
+"""`--node CELL/NODE` and `status --site` where there is no such cell, nobody answers, or the machine has no daemon."""
 
 from __future__ import annotations
 

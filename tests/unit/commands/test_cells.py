@@ -1,4 +1,4 @@
-"""`zsched site` and `zsched history --site` on a machine whose daemon does not run."""
+"""`zsched status --site` and `zsched history --site` on a machine whose daemon does not run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ nodes:
   robot1: {kind: robot, host: 127.0.0.1, listen: {control: tcp/127.0.0.1:7457, data: tcp/127.0.0.1:7458}}
 """
 SITE = "site: {hall-b: {gateways: [tcp/192.0.2.31:7457, tcp/192.0.2.32:7457]}}\n"
-VERBS = (("site",), ("history", "--site"))
+VERBS = (("status", "--site"), ("history", "--site"))
 
 
 def run(*words: str) -> Result:
@@ -72,3 +72,11 @@ def test_the_cells_are_those_of_the_stored_document(
     assert asked == ["tcp/192.0.2.31:7457"]
     machine.config.write_text(FILE.replace("hall-a", "hall-c"))
     assert "what it has of fleet hall-c names no other" in run(*words).stderr, "another fleet's document is not meant"
+
+
+@pytest.mark.parametrize(
+    "words", [("--connect", "tcp/127.0.0.1:1"), ("--node", "hall-b/robot7"), ("--watch",), ("-v",)]
+)
+def test_a_site_is_asked_whole_and_once(words: tuple[str, ...]) -> None:
+    result = run("status", "--site", *words)
+    assert (result.exit_code, result.stdout, "leave out" in result.stderr) == (2, "", True)

@@ -1,4 +1,4 @@
-"""`zsched history`, `zsched events` and `zsched replay`: pages put together, times, filters, what differs."""
+"""`zsched history`, `zsched events` and `explain --replay`: pages put together, times, filters, what differs."""
 
 from __future__ import annotations
 
@@ -380,9 +380,9 @@ def run(*arguments: object) -> Any:
 
 def test_a_log_is_judged_again_and_all_is_equal(tmp_path: Path) -> None:
     file = log_of(tmp_path, decision(0.1), decision(1 / 3), decision(0.9))
-    done = run("replay", file)
+    done = run("explain", "--replay", file)
     assert (done.exit_code, done.stdout) == (0, "3 judgements made again, all equal\n")
-    body = json.loads(run("replay", file, "--json").stdout)
+    body = json.loads(run("explain", "--replay", file, "--json").stdout)
     assert faults(body) == []
     assert (body["schema"], body["judged"], body["equal"]) == ("zsched.replay/1", 3, True)
 
@@ -393,10 +393,10 @@ def test_the_first_judgement_that_differs_is_named(tmp_path: Path) -> None:
     aggregates = tuple((name, value * (1 + 2**-52)) for name, value in one.verdict.aggregates)
     other = replace(one, verdict=replace(one.verdict, aggregates=aggregates))
     file = log_of(tmp_path, one, other, other)
-    done = run("replay", file)
+    done = run("explain", "--replay", file)
     assert done.exit_code == 1
     assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [f"{file}:3:", f"{file}:3:"]
-    body = json.loads(run("replay", file, "--json").stdout)
+    body = json.loads(run("explain", "--replay", file, "--json").stdout)
     assert faults(body) == []
     assert (body["judged"], body["equal"], body["line"]) == (1, False, 3)
 
@@ -406,12 +406,12 @@ def test_what_is_no_log_is_refused_with_its_line(tmp_path: Path, line: str) -> N
     file = log_of(tmp_path, decision(0.5))
     with file.open("a") as more:
         more.write(f"{line}\n")
-    done = run("replay", file)
+    done = run("explain", "--replay", file)
     assert done.exit_code == EXIT_USAGE
     assert f"{file}:3: no line of a decision log" in done.stderr
-    assert run("replay", tmp_path / "nothing").exit_code == EXIT_USAGE
+    assert run("explain", "--replay", tmp_path / "nothing").exit_code == EXIT_USAGE
     (tmp_path / "empty").touch()
-    assert run("replay", tmp_path / "empty").exit_code == EXIT_USAGE
+    assert run("explain", "--replay", tmp_path / "empty").exit_code == EXIT_USAGE
 
 
 @pytest.mark.parametrize("cut", [1, 12, 60, 400])
@@ -421,11 +421,11 @@ def test_a_line_that_a_power_cut_has_torn_is_left_out_and_told(tmp_path: Path, c
     file = log_of(tmp_path, decision(0.1), decision(0.5))
     whole = file.read_bytes()
     file.write_bytes(whole[: whole[:-1].rindex(b"\n") + 1 + cut] + filled)
-    done = run("replay", file)
+    done = run("explain", "--replay", file)
     assert (done.exit_code, done.stdout.splitlines()[0]) == (0, "1 judgement made again, all equal")
     assert done.stdout.splitlines()[1].endswith("has torn it: line 3")
     log_of(tmp_path, decision(0.9))
-    body = json.loads(run("replay", file, "--json").stdout)
+    body = json.loads(run("explain", "--replay", file, "--json").stdout)
     assert faults(body) == []
     assert (body["judged"], body["equal"], body["torn"]) == (2, True, [3])
 
@@ -456,3 +456,9 @@ def test_a_type_that_there_is_not_is_named_with_those_there_are() -> None:
     assert refused.value.code == EXIT_USAGE
     with pytest.raises(CliError, match="no event is of type 'warning'; there are move, scheduler, vote"):
         types_of("warning")
+
+
+@pytest.mark.parametrize("words", [(), ("echo", "--replay", "decisions.ndjson")])
+def test_a_task_or_a_log_is_explained(words: tuple[str, ...]) -> None:
+    done = run("explain", *words)
+    assert (done.exit_code, "name a task, or a decision log with --replay FILE" in done.stderr) == (EXIT_USAGE, True)

@@ -63,6 +63,8 @@ def test_nobody_takes_a_verb_of_the_program(monkeypatch: pytest.MonkeyPatch) -> 
         (("list",), "write zsched status"),
         (("stauts", "--json"), "write zsched status"),
         (("weights", "echo", "cpu=1"), "write zsched tune TASK cpu="),
+        (("site", "--json"), "write zsched status --site"),
+        (("replay", "decisions.ndjson"), "write zsched explain --replay FILE"),
         (("fly",), "`zsched --help` lists them"),
         *(((near,), "") for near in ("recove", "rejion", "leav", "uninstal", "inti")),
     ],

@@ -421,7 +421,7 @@ def test_what_a_ping_found_wraps_between_words_and_leaves_an_address_whole(
         ("move", "[OPTIONS] TASK NODE", "TASK"),
         ("history", "[OPTIONS] [TASK]", "[TASK]"),
         ("drain", "[OPTIONS] [NODE]...", "[NODE]..."),
-        ("replay", "[OPTIONS] FILE", "FILE"),
+        ("restart", "[OPTIONS] TASK [NODE]", "TASK"),
         ("tune", "[OPTIONS] [TASK] [KEY=VALUE]...", "[KEY=VALUE]..."),
         ("dev", "[OPTIONS] [FILE]", "[FILE]"),
         ("status", "[OPTIONS]", ""),

@@ -1,7 +1,7 @@
 """The decision log: one line of JSON for every story of the daemon, in two files of the state folder.
 
 A line tells what happened, when by this machine's wall clock, and in which life of the daemon. A judgement that has
-changed carries all of its figures, so that `zsched replay` can make it again. At rest nothing is written.
+changed carries all of its figures, so that `zsched explain --replay` can make it again. At rest nothing is written.
 
 The loop only puts stories into a bounded queue; a thread makes the lines and appends them. A file that is full becomes
 the older one, so both together never hold more than twice `FILE_BYTES`. A disk that refuses costs lines, which are

@@ -3,8 +3,8 @@
 Knows: the order of a judgement's steps. Does not know: where the figures come from (`zsched.core.scheduler.rounds`),
 what becomes of the judgement, files.
 
-`decide` is what a robot runs in every round, and what `zsched replay` runs on figures that were written down: the same
-figures give the same judgement, bit for bit.
+`decide` is what a robot runs in every round, and what `explain --replay` runs on figures that were written down: the
+same figures give the same judgement, bit for bit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One judgement of one task with every figure that it went by: what `zsched explain` shows and `zsched replay` repeats.
+"""One judgement of one task with each figure that it went by: what `zsched explain` shows and `--replay` repeats.
 
 Knows: the fields. Does not know: how a judgement comes about (`zsched.core.scheduler.decision`), text, files.
 
