@@ -80,7 +80,7 @@ UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 GROUPS = (stream.GROUP, member.FLEET, fleet.TASK, fleet.NODE, pki.GROUP, question.METRICS)
 VERBS: tuple[Callable[..., None], ...] = (
-    *(daemon.up, daemon.init, daemon.recover, daemon.rejoin, daemon.dev),
+    *(daemon.up, daemon.init, daemon.new, daemon.dev),
     *(question.status, watch.top, watch.web, watch.record, watch.trace),
     *(question.explain, question.history, question.events),
     *(order.move, order.pin, order.unpin, order.pause, order.resume, order.tune),

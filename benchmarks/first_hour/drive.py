@@ -82,7 +82,7 @@ def play_task(example: str, play: dict[str, Any], terminal: Terminal) -> dict[st
     """From the example to answers that go on after a kill; what it took."""
     began, first = time.monotonic(), len(terminal.typed)
     folder = HOME / f"my-{example}"
-    terminal.run(play["begin"].replace("--example python", f"--example {example}").replace("my-task", folder.name))
+    terminal.run(play["begin"].replace("new python", f"new {example}").replace("my-task", folder.name))
     own: dict[str, str] = play["tasks"][example]["files"]
     for name, text in own.items():
         (folder / name).write_text(text)

@@ -174,8 +174,8 @@ def test_second_daemon_in_the_same_folders_is_refused(site: Site) -> None:
     assert "Traceback" not in second.stderr
 
 
-def test_init_under_a_running_daemon_is_refused(site: Site) -> None:
-    refused = site.zsched("init", "--generation", "1")
+def test_a_new_generation_under_a_running_daemon_is_refused(site: Site) -> None:
+    refused = site.zsched("fleet", "recover", "--generation", "1")
     assert refused.returncode == 1
     assert "stop that daemon first" in refused.stderr
 

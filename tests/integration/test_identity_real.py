@@ -31,7 +31,8 @@ def bed(tmp_path: Path) -> Iterator[Testbed]:
 
 
 def run_init(bed: Testbed, node: str, folder: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "zsched.cli", "init", "--config", str(bed.file), "--node", node]
+    verb = ("fleet", "recover") if more else ("init",)
+    command = [sys.executable, "-m", "zsched.cli", *verb, "--config", str(bed.file), "--node", node]
     command += ["--state-dir", str(folder), *more]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
@@ -102,7 +103,7 @@ def test_a_new_generation_is_made_node_by_node_where_too_many_states_are_lost(be
     again, voted = bed.folder / "again", f"knows {elector} as an elector that has voted"
     twice = init_that_says(bed, voted, elector, again, "--generation", "1")
     assert twice.returncode == 1, "it has voted in this generation"
-    init_that_says(bed, "`zsched init --generation 2 --force` on every node", elector, again)
+    init_that_says(bed, "`zsched fleet recover --generation 2 --force` on every node", elector, again)
 
 
 def test_the_advice_of_init_leads_to_a_fleet_that_agrees(bed: Testbed) -> None:

@@ -23,9 +23,9 @@ DEAD: tuple[NodeId, ...] = ("robot1", "robot2", "robot3")
 DANGERS = ("--accept", "old-electors-are-off", "--accept", "newest-may-be-lost")
 
 
-def run(bed: Testbed, verb: str, node: NodeId, *more: str) -> subprocess.CompletedProcess[str]:
-    """Run a verb of a node whose daemon is stopped."""
-    command = [sys.executable, "-m", "zsched.cli", verb, *more, "--config", str(bed.file), "--node", node]
+def run(bed: Testbed, node: NodeId, *more: str) -> subprocess.CompletedProcess[str]:
+    """Run the verb on a node whose daemon is stopped."""
+    command = [sys.executable, "-m", "zsched.cli", "fleet", "recover", *more, "--config", str(bed.file), "--node", node]
     command += ["--state-dir", str(bed.folder / node)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
@@ -67,17 +67,17 @@ def test_a_survivor_recovers_the_fleet_and_an_old_elector_that_comes_back_change
         for name in DEAD:
             bed.kill(name)
         bed.wait(lambda: not bed.status("robot4")["quorum"]["ok"], 60, "the quorum to be lost")
-        running = run(bed, "recover", "robot4")
+        running = run(bed, "robot4")
         assert running.returncode == EXIT_FAILED
         assert "stop that daemon first" in running.stderr
 
         bed.stop("robot4")
-        refused = run(bed, "recover", "robot4")
+        refused = run(bed, "robot4")
         assert refused.returncode == EXIT_FAILED
         assert "old-electors-are-off: robot1, robot2, robot3 decide no more" in refused.stderr
-        assert run(bed, "recover", "robot4", "--plan").returncode == EXIT_WOULD_CHANGE
-        assert run(bed, "recover", "robot4", *DANGERS).returncode == EXIT_USAGE, "off a terminal it takes --yes"
-        done = run(bed, "recover", "robot4", *DANGERS, "--yes")
+        assert run(bed, "robot4", "--plan").returncode == EXIT_WOULD_CHANGE
+        assert run(bed, "robot4", *DANGERS).returncode == EXIT_USAGE, "off a terminal it takes --yes"
+        done = run(bed, "robot4", *DANGERS, "--yes")
         assert done.returncode == EXIT_OK, done.stderr
         assert "robot4 is the only elector of generation" in done.stdout
         bed.start("robot4")
@@ -86,7 +86,7 @@ def test_a_survivor_recovers_the_fleet_and_an_old_elector_that_comes_back_change
         bed.wait(lambda: "(recovered by robot4)" in problem_of(bed, "edge1", "robot4"), 60, "edge1 to say who")
         bed.wait(lambda: problem_of(bed, "robot4", "edge1"), 60, "robot4 to show the stranger")
         bed.stop("edge1")
-        joined = run(bed, "rejoin", "edge1", "--yes")
+        joined = run(bed, "edge1", "--rejoin", "--yes")
         assert joined.returncode == EXIT_OK, joined.stderr
         bed.start("edge1")
         bed.wait(lambda: bed.owner("robot4", "edge1") == "edge1", 60, "one elector to replace the dead owner")
@@ -99,7 +99,7 @@ def test_a_survivor_recovers_the_fleet_and_an_old_elector_that_comes_back_change
         assert bed.owner("robot4", "edge1") == "edge1"
         assert bed.task("robot1")["owner"] == "robot1", "nothing crosses"
         bed.stop("robot1")
-        joined = run(bed, "rejoin", "robot1", "--yes")
+        joined = run(bed, "robot1", "--rejoin", "--yes")
         assert joined.returncode == EXIT_OK, joined.stderr
         bed.start("robot1")
         three = ["edge1", "robot1", "robot4"]
@@ -118,12 +118,12 @@ def test_two_halves_that_were_both_recovered_show_each_other_and_stay_apart(tmp_
         bed.wait_settled()
         bed.stop()
         for survivor, other in halves:
-            done = run(bed, "recover", survivor, *DANGERS, "--yes")
+            done = run(bed, survivor, *DANGERS, "--yes")
             assert done.returncode == EXIT_OK, done.stderr
             bed.start(survivor, other)
             bed.wait(partial(problem_of, bed, other, survivor), 60, f"{other} to see what {survivor} has recovered")
             bed.stop(other)
-            joined = run(bed, "rejoin", other, "--yes")
+            joined = run(bed, other, "--rejoin", "--yes")
             assert joined.returncode == EXIT_OK, joined.stderr
             bed.start(other)
             bed.wait(lambda: bed.owner(survivor, other) == survivor, 60, f"the task on {survivor}")  # noqa: B023 - called here

@@ -81,14 +81,14 @@ def test_a_secured_fleet_is_recovered_and_joined_again_by_word(tmp_path: Path) -
         bed.wait(lambda: not bed.status("robot4")["quorum"]["ok"], 60, "the quorum to be lost")
         bed.stop("robot4")
         # edge1 lives on and is asked, over TLS; without a certificate nobody would answer
-        assert zsched(bed, "robot4", "recover", "--plan").returncode == EXIT_WOULD_CHANGE
-        assert "robot4 is the only elector of generation" in done(bed, "robot4", "recover", *DANGERS, "--yes")
+        assert zsched(bed, "robot4", "fleet", "recover", "--plan").returncode == EXIT_WOULD_CHANGE
+        assert "robot4 is the only elector of generation" in done(bed, "robot4", "fleet", "recover", *DANGERS, "--yes")
         bed.start("robot4")
 
         bed.wait(lambda: strangers(bed, "edge1") == {"robot4"}, 60, "edge1 to show who counts otherwise")
         bed.wait(lambda: strangers(bed, "robot4") == {"edge1"}, 60, "robot4 to show the stranger")
         bed.stop("edge1")
-        assert "recovered by robot4 (robot4 count by it)" in done(bed, "edge1", "rejoin", "--yes")
+        assert "recovered by robot4 (robot4 count by it)" in done(bed, "edge1", "fleet", "recover", "--rejoin", "--yes")
         bed.start("edge1")
         bed.wait(lambda: bed.owner("robot4", "edge1") == "edge1", 90, "one elector to replace the dead owner")
         assert bed.task("robot4")["epoch"] > 2**32
@@ -100,7 +100,7 @@ def test_a_secured_fleet_is_recovered_and_joined_again_by_word(tmp_path: Path) -
         bed.wait(lambda: strangers(bed, "robot4") == {"robot1"}, 60, "robot4 to show it, too")
         assert bed.owner("robot4", "edge1") == "edge1", "nothing crosses"
         bed.stop("robot1")
-        done(bed, "robot1", "rejoin", "--yes")
+        done(bed, "robot1", "fleet", "recover", "--rejoin", "--yes")
         bed.start("robot1")
         three = ["edge1", "robot1", "robot4"]
         bed.wait(lambda: bed.status("robot4")["quorum"]["names"] == three, 90, "the electors to be three again")

@@ -103,7 +103,7 @@ def test_electors_that_have_all_lost_their_state_say_what_the_operator_does() ->
     assert "--force" not in problems(sim, "edge1"), "they may come back"
     sim.run(65)
     for name in ("edge1", "robot1"):
-        assert "`zsched init --generation 2 --force` on every node" in problems(sim, name), problems(sim, name)
+        assert "`zsched fleet recover --generation 2 --force` on every node" in problems(sim, name), problems(sim, name)
 
 
 def test_a_node_without_a_state_proposes_nothing_before_an_elector_has_said_which_generation_it_is() -> None:

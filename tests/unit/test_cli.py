@@ -56,17 +56,20 @@ def test_a_program_that_is_started_from_a_verb_has_all_three_streams() -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("--generation", "99999999999", "--node", "edge1"), "--generation 99999999999: at most 1048575"),
-        (("--node", "edg1"), "no node 'edg1' under 'nodes' (there are"),
+        (
+            ("fleet", "recover", "--generation", "99999999999", "--node", "edge1"),
+            "--generation 99999999999: at most 1048575",
+        ),
+        (("init", "--node", "edg1"), "no node 'edg1' under 'nodes' (there are"),
     ],
 )
-def test_init_with_a_wrong_word_ends_as_usage_and_writes_nothing(
+def test_a_wrong_word_for_a_state_ends_as_usage_and_writes_nothing(
     words: tuple[str, ...], says: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET)
     state = tmp_path / "state"
-    result = CliRunner().invoke(app, ["init", "--config", str(file), "--state-dir", str(state), *words])
+    result = CliRunner().invoke(app, [*words, "--config", str(file), "--state-dir", str(state)])
     assert result.exit_code == 2, result.stderr
     assert says in result.stderr
     assert not state.exists()

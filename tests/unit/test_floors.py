@@ -35,7 +35,7 @@ FLOORS: Final[tuple[tuple[str, int, str], ...]] = (
     (r"(pki|relay|worker)(?:\..+)?", 5, "\\1"),
     (r"(drivers|runtime|stream)(?:\..+)?", 6, "\\1"),
     (r"tasks(?:\.(\w+))?(?:\..+)?", 7, "tasks: \\1"),
-    (r"examples(?:\.(\w+))?(?:\..+)?", 7, "tasks: example \\1"),  # programs that `zsched init --example` copies
+    (r"examples(?:\.(\w+))?(?:\..+)?", 7, "tasks: example \\1"),  # programs that `zsched new` copies
     (r"daemon", 7, "daemon"),
     (r"dev(\..+)?", 7, "dev"),
     (r"doctor(\..+)?", 7, "doctor"),

@@ -102,7 +102,7 @@ def shown_on_a_terminal(arguments: list[str], folder: Path) -> str:
         (["zsched", "check", "wrong.yaml"], "did you mean 'wifi'?"),
         (["zsched", "drain", "--only", "old", "--"], "Error: Invalid value for '--only': 'old' is not"),
         (["zsched", "status", "--interval", "0"], "Input should be greater"),
-        (["zsched", "dev", "empty"], "zsched init --example python empty"),
+        (["zsched", "dev", "empty"], "zsched new python empty"),
     ],
 )
 def test_what_a_verb_refuses_fits_the_terminal(arguments: list[str], words: str, tmp_path: Path) -> None:

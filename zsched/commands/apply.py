@@ -15,7 +15,17 @@ from typing import TextIO
 
 from zsched import paths as places
 from zsched.commands.ask import Door
-from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, print_json, say, says_yes, warn
+from zsched.commands.common import (
+    CliError,
+    Json,
+    check_dangers,
+    check_reason,
+    check_taken,
+    confirm,
+    print_json,
+    say,
+    warn,
+)
 from zsched.commands.document import (
     QUESTION,
     InForce,
@@ -38,7 +48,7 @@ from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.struct import Struct, replace
 from zsched.errors import ConfigError
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_WOULD_CHANGE
 from zsched.files import read_regular
 from zsched.runtime.restarts import opens_anew, restarts
 from zsched.runtime.zenoh_file import judged
@@ -131,7 +141,7 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
         CliError: nobody answers, the change is refused, overtaken, or not accepted.
         ConfigError: the new file has faults.
     """
-    _check_accepted(view)
+    check_dangers(view.accepted, DANGERS)
     check_reason(view.reason)
     held = in_force(door)
     return agree(door, view, make_plan(door, held, make(held), file, view, part))
@@ -143,7 +153,7 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
     Raises:
         CliError: it is refused, overtaken, or not accepted.
     """
-    _check_accepted(view)
+    check_dangers(view.accepted, DANGERS)
     check_reason(view.reason)
     held = plan.held
     if view.revision is not None and view.revision != held.revision:
@@ -156,12 +166,8 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
         (warn if view.is_data else say)(table(plan), indent=6)
     if view.is_plan:
         return _tell(view, plan, "planned", held.revision, EXIT_WOULD_CHANGE)
-    missing = [(name, means) for name, means in plan.dangers if name not in view.accepted]
-    if missing:
-        names = [part for name in dict.fromkeys(name for name, _ in missing) for part in ("--accept", name)]
-        lines = "\n".join(f"  {name}: {means}" for name, means in missing)
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again(*names)}")
-    _confirm(view, plan)
+    check_taken(plan.dangers, view.accepted)
+    confirm(f"Change {held.fleet} for all its nodes?", is_sure=view.is_sure, can_ask=view.words[-1] != STDIN)
     return _commit(door, view, plan)
 
 
@@ -335,20 +341,6 @@ def _body(plan: Plan, outcome: str, revision: int) -> Json:
 
 
 # --- asking, and agreeing --------------------------------------------------------------------------------------------
-
-
-def _check_accepted(view: ApplyView) -> None:
-    check_dangers(view.accepted, DANGERS)
-
-
-def _confirm(view: ApplyView, plan: Plan) -> None:
-    """Let the operator decide; off a terminal it takes --yes."""
-    if view.is_sure:
-        return
-    if not sys.stdin.isatty() or view.words[-1] == STDIN:
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{again('--yes')}")
-    if not says_yes(f"Change {plan.held.fleet} for all its nodes?", sys.stderr):
-        raise CliError(EXIT_FAILED, "nothing was changed")
 
 
 def _commit(door: Door, view: ApplyView, plan: Plan) -> int:

@@ -318,6 +318,34 @@ def check_dangers(accepted: Iterable[str], known: Sequence[str]) -> None:
             raise CliError(EXIT_USAGE, f"--accept: there is no danger {name!r}{nearest(name, known)}")
 
 
+def check_taken(dangers: Iterable[tuple[str, str]], accepted: Iterable[str]) -> None:
+    """Refuse where one of the dangers, each with what it means, is not accepted by its name.
+
+    Raises:
+        CliError: with the command that accepts it.
+    """
+    missing = [(name, means) for name, means in dangers if name not in accepted]
+    if missing:
+        names = [part for name in dict.fromkeys(name for name, _ in missing) for part in ("--accept", name)]
+        lines = "\n".join(f"  {name}: {means}" for name, means in missing)
+        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again(*names)}")
+
+
+def confirm(question: str, *, is_sure: bool, can_ask: bool = True) -> None:
+    """Let the operator decide who has not said --yes.
+
+    Raises:
+        CliError: off a terminal (2), or the answer is no (1).
+    """
+    if is_sure:
+        return
+    if not (can_ask and sys.stdin.isatty()):
+        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{again('--yes')}")
+    sys.stdout.flush()
+    if not says_yes(question, sys.stderr):
+        raise CliError(EXIT_FAILED, "nothing was changed")
+
+
 def told_task(status: Json, task: str) -> Json:
     """What a status tells of the task; empty: nothing."""
     return next((one for one in status["tasks"] if one["name"] == task), {})

@@ -1,4 +1,4 @@
-"""The verbs of this machine's own node: `up`, `init`, `recover`, `rejoin`, `dev`: arguments in, exit code out.
+"""The verbs of this machine's own node: `up`, `init`, `new`, `dev`: arguments in, exit code out.
 
 Knows: options. Does not know: how anything is done (files of the verbs' names, imported by the verb that runs).
 """
@@ -11,10 +11,8 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError
 from zsched.commands.example import Example, give_example
-from zsched.commands.options import AcceptOption, Here, Machine, PlanOption, YesOption
-from zsched.exits import EXIT_USAGE
+from zsched.commands.options import Here, Machine
 
 
 class LogLevel(StrEnum):
@@ -38,22 +36,6 @@ def up(
 
 def init(
     here: Here,
-    folder: Annotated[
-        Path | None, typer.Argument(metavar="DIR", help="With --example: where; without it the current folder.")
-    ] = None,
-    example: Annotated[
-        Example | None, typer.Option("--example", help="Write an example into DIR instead; nothing is overwritten.")
-    ] = None,
-    generation: Annotated[
-        int,
-        typer.Option("--generation", metavar="G", min=0, help="Above 0: start anew, on every node."),
-    ] = 0,
-    force: Annotated[
-        bool, typer.Option("--force", help="With --generation: although nobody says that it is needed.")
-    ] = False,
-    settle: Annotated[
-        bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")
-    ] = False,
     accept: Annotated[
         list[str] | None,
         typer.Option("--accept", metavar="DANGER", help="lost-state: its state is lost, and no other node is left."),
@@ -62,66 +44,23 @@ def init(
     """Create this node's blank state: "this name has never voted here".
 
     Refuses in another node's folder, and when a node that can be reached knows this name as an elector that has voted.
-    If too many states are lost to agree, stop every daemon, and run it on every node with the --generation that
-    `zsched status` names. That is refused while the fleet agrees, and where a good state would be lost.
-
     A machine that has lost its state gets the fleet's document first: what `zsched fleet export` writes on a living
-    node, as its fleet file.
-
-    With --example it writes no state but a small task: a fleet file, a worker, an application (see `zsched dev`).
+    node, as its fleet file. Where too many states are lost to agree, `zsched fleet recover --generation` begins anew.
     """
-    if example is not None:
-        if here.config or here.node or here.state_dir or generation or force or settle or accept:
-            raise CliError(EXIT_USAGE, "--example goes with a folder only")
-        give_example(example, folder or Path())
-        return
-    if folder is not None:
-        raise CliError(EXIT_USAGE, f"{folder}: a folder goes with --example; name the state folder with --state-dir")
-    from zsched.commands.init import create_state  # noqa: PLC0415 - each verb imports what it needs
+    from zsched.commands.init import create_state, place_of  # noqa: PLC0415 - each verb imports what it needs
 
-    place = (here.config, here.node, here.state_dir)
-    create_state(*place, generation, is_forced=force, is_settling=settle, accepted=accept or ())
+    create_state(place_of(here), accepted=accept or ())
 
 
-def recover(
-    here: Here,
-    brought: Annotated[
-        list[Path] | None,
-        typer.Option("--from", metavar="STATE_FILE", help="State of a dead machine's disk; give it once for each."),
-    ] = None,
-    plan: PlanOption = False,
-    yes: YesOption = False,
-    accept: AcceptOption = None,
+def new(
+    kind: Annotated[Example, typer.Argument(metavar="KIND", help="python, ros2 or zenoh: which way its worker goes.")],
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where. [the current folder]")] = Path(),
 ) -> None:
-    """Begin a new generation on one survivor when a majority of the electors is lost for good.
+    """Write a small task to begin with: a fleet file, a worker, an application (see `zsched dev`).
 
-    Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
-    refused while a majority of the electors can agree. Every other node changes sides by `zsched rejoin` there.
+    Nothing is overwritten.
     """
-    from zsched.commands.recover import Manner, place_of  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.recover import recover as run  # noqa: PLC0415 - as above
-
-    manner = Manner(is_plan=plan, is_sure=yes, accepted=tuple(accept or ()))
-    raise typer.Exit(run(place_of(here.config, here.node, here.state_dir), manner, tuple(brought or ())))
-
-
-def rejoin(
-    here: Here,
-    generation: Annotated[
-        str, typer.Argument(metavar="[GENERATION]", help="The beginning of its id; needed where there are several.")
-    ] = "",
-    plan: PlanOption = False,
-    yes: YesOption = False,
-) -> None:
-    """Let this node change sides to another generation of its fleet, as after `zsched recover` elsewhere.
-
-    It starts blank there: what it has promised and learnt in its own generation is dropped. Its daemon must be stopped.
-    """
-    from zsched.commands.recover import Manner, place_of  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.recover import rejoin as run  # noqa: PLC0415 - as above
-
-    manner = Manner(is_plan=plan, is_sure=yes)
-    raise typer.Exit(run(place_of(here.config, here.node, here.state_dir), manner, generation))
+    give_example(kind, folder)
 
 
 def dev(

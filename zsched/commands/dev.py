@@ -64,7 +64,7 @@ def dev(options: DevOptions) -> int:
     file = _file(options.file)
     fleet = load_fleet(file)
     if not fleet.tasks:
-        advice = "write one under `tasks:` (docs/guide/fleet-file.md), or begin with `zsched init --example python`"
+        advice = "write one under `tasks:` (docs/guide/fleet-file.md), or begin with `zsched new python`"
         raise CliError(EXIT_CONFIG, f"{file} has no task, and there is nothing to run; {advice}")
     commands = _commands(fleet, file, options.workers)
     with ExitStack() as stack:
@@ -96,14 +96,14 @@ def _file(given: Path | None) -> Path:
             raise CliError(
                 EXIT_CONFIG,
                 f"no {HERE} in the folder {given}; name the fleet file, or begin with "
-                f"`zsched init --example python {shlex.quote(str(given))}`",
+                f"`zsched new python {shlex.quote(str(given))}`",
             )
         return given / HERE
     file = HERE if HERE.exists() else places.config_path(None, os.environ)
     if not file.exists():
         raise CliError(
             EXIT_CONFIG,
-            f"no {HERE} here, and no {file}; name the fleet file, or begin with `zsched init --example python`",
+            f"no {HERE} here, and no {file}; name the fleet file, or begin with `zsched new python`",
         )
     return file
 

@@ -1,4 +1,4 @@
-"""`zsched init --example`: writes a small complete example, a fleet file, a worker and an application, into a folder.
+"""`zsched new`: writes a small complete example, a fleet file, a worker and an application, into a folder.
 
 Knows: the examples that the package holds, and that nothing is overwritten. Does not know: what is in them.
 """

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, again, check_dangers, nearest, print_json, say, told_task
+from zsched.commands.common import CliError, Json, check_dangers, check_taken, nearest, print_json, say, told_task
 from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT
 from zsched.commands.orders import (
@@ -304,12 +304,12 @@ def _check_dangers(
     ]
     if not told:
         return None
-    means = f"{NO_OTHER}: {', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
+    means = f"{', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
     if view.is_plan and not view.is_json:
-        say(means)
-    if not view.is_plan and not accepted:
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n  {means}\n{again('--accept', NO_OTHER)}")
-    return means
+        say(f"{NO_OTHER}: {means}")
+    if not view.is_plan:
+        check_taken([(NO_OTHER, means)], accepted)
+    return f"{NO_OTHER}: {means}"
 
 
 def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) -> int:

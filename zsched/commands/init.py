@@ -1,4 +1,4 @@
-"""`zsched init`: creates a node's blank state, or settles a dispute about its name.
+"""`zsched init` and `zsched fleet recover --generation|--settle`: a node's blank state, or the end of a dispute.
 
 Knows: whom the others' answers let begin, in words. Does not know: states and sessions (`zsched.runtime.init`), what
 an authority's folder holds (`zsched.commands.pki`).
@@ -16,9 +16,12 @@ from zsched.adapters.host.state_file import STATE_NAME
 from zsched.adapters.machine import core_speed
 from zsched.commands.common import CliError, check_dangers, counted, say, warn
 from zsched.commands.here import own_name
+from zsched.commands.options import Here
 from zsched.commands.pki import known_here
 from zsched.config.load import load_fleet, require_node
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.model import NodeId
+from zsched.core.values.struct import Struct
 from zsched.core.vote.belief import MAX_GENERATION
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
@@ -35,45 +38,59 @@ LOST_STATE: Final = "lost-state"
 DANGERS: Final = (LOST_STATE,)
 
 
+class Place(Struct, frozen=True, kw_only=True):
+    """Which node it is, and where its files are."""
+
+    fleet: Fleet
+    node: NodeId
+    config: Path
+    folder: Path
+
+
+def place_of(here: Here) -> Place:
+    """The node that the options mean, or the environment.
+
+    Raises:
+        CliError: --node names none of the fleet file.
+        ConfigError: the fleet file cannot be used, or has no node of this machine's name.
+    """
+    file = places.config_path(here.config, os.environ)
+    fleet = load_fleet(file)
+    name = own_name(here.node)
+    try:
+        require_node(fleet, name, file)
+    except ConfigError as error:
+        if here.node is None:
+            raise
+        raise CliError(EXIT_USAGE, str(error)) from error  # a wrong word, and no wrong file
+    return Place(fleet=fleet, node=name, config=file, folder=places.state_folder(here.state_dir, os.environ))
+
+
 def create_state(
-    config: Path | None,
-    node: str | None,
-    state_dir: Path | None,
-    generation: int,
+    place: Place,
+    generation: int = 0,
     *,
-    is_forced: bool,
-    is_settling: bool,
+    is_forced: bool = False,
+    is_settling: bool = False,
     accepted: Sequence[str] = (),
 ) -> None:
     """Write the blank state of this machine's node, where nothing speaks against it.
 
     Args:
-        config: the fleet file, as for `up`.
-        node: this machine's name in it.
-        state_dir: where the state goes.
+        place: the node, and where its state goes.
         generation: above 0 the fleet starts anew with it.
         is_forced: although nobody says that it is needed.
         is_settling: write none, but make the node an elector again whose name another machine had.
         accepted: names of dangers.
 
     Raises:
-        CliError: the words do not go together, or name no node; or the state seems to be lost.
-        ConfigError: the fleet file cannot be used.
+        CliError: the words do not go together; or the state seems to be lost.
         AdapterError: something speaks against it, or the folder cannot be written.
     """
     check_dangers(accepted, DANGERS)
     if generation > MAX_GENERATION:
         raise CliError(EXIT_USAGE, f"--generation {generation}: at most {MAX_GENERATION}")
-    file = places.config_path(config, os.environ)
-    fleet = load_fleet(file)
-    name = own_name(node)
-    try:
-        require_node(fleet, name, file)
-    except ConfigError as error:
-        if node is None:
-            raise
-        raise CliError(EXIT_USAGE, str(error)) from error  # a wrong word, and no wrong file
-    state = places.state_folder(state_dir, os.environ)
+    fleet, name, file, state = place.fleet, place.node, place.config, place.folder
     if is_settling:
         done = settle_dispute(fleet, name, state)
         say(f"{name}: {'settled; start its daemon' if done else 'there was no dispute'}")

@@ -18,7 +18,7 @@ from typing import Final
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, say, warn
+from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, check_taken, say, warn
 from zsched.commands.document import QUESTION, UNKNOWING, InForce, ask_all, change, document_text, in_force, ordered
 from zsched.commands.entries import DOCUMENT, HERE
 from zsched.commands.flags import (
@@ -196,9 +196,8 @@ def accept(order: LeaveOrder, *dangers: tuple[str, str]) -> None:
     Raises:
         CliError: one is not.
     """
-    missing = [f"--accept {name}: {means}" for name, means in dangers if name not in order.accepted]
-    if missing and not order.is_plan:
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be, {'; and '.join(missing)}")
+    if not order.is_plan:
+        check_taken(dangers, order.accepted)
     _warn(order, dangers)
 
 

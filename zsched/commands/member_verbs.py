@@ -1,4 +1,4 @@
-"""The verbs by which machines come and go: `fleet create`, `invite`, `join`, `leave`.
+"""The verbs by which machines come and go: `fleet create`, `fleet recover`, `invite`, `join`, `leave`.
 
 Knows: options. Does not know: how anything is done (`zsched.commands.membership`, imported by
 the verb that runs).
@@ -213,8 +213,58 @@ def leave(
     raise typer.Exit(go(order))
 
 
+def recover_fleet(
+    here: Here,
+    wanted: Annotated[
+        str, typer.Argument(metavar="[GENERATION]", help="With --rejoin: how its id begins, where there are several.")
+    ] = "",
+    brought: Annotated[
+        list[Path] | None,
+        typer.Option("--from", metavar="STATE_FILE", help="State of a dead machine's disk; give it once for each."),
+    ] = None,
+    rejoin: Annotated[
+        bool, typer.Option("--rejoin", help="Change sides to another generation, and start blank.")
+    ] = False,
+    generation: Annotated[
+        int, typer.Option("--generation", metavar="G", min=0, help="No state is left to go on with: start anew as G.")
+    ] = 0,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --generation: although nobody says that it is needed.")
+    ] = False,
+    settle: Annotated[
+        bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")
+    ] = False,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    accept: AcceptOption = None,
+) -> None:
+    """Begin a new generation on one survivor when a majority of the electors is lost for good.
+
+    Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
+    refused while a majority of the electors can agree.
+
+    With --rejoin the daemon of another node, stopped too, is brought over: what that one has promised and learnt in its
+    own generation is dropped. With --generation, on every node, all daemons stopped, the fleet starts anew with the G
+    that `zsched status` names; refused while it agrees, and where a good state would be lost.
+    """
+    is_anew, accepted = bool(generation or settle or force), tuple(accept or ())
+    if rejoin + settle + (generation > 0) > 1 or (plan and is_anew):
+        raise CliError(EXIT_USAGE, "give one of --rejoin, --generation G and --settle; the last two go without --plan")
+    if (wanted and not rejoin) or (brought and (rejoin or is_anew)):
+        raise CliError(EXIT_USAGE, "a GENERATION goes with --rejoin, and --from with neither it nor --generation")
+    from zsched.commands import init, recover  # noqa: PLC0415 - each verb imports what it needs
+
+    place, manner = init.place_of(here), recover.Manner(is_plan=plan, is_sure=yes, accepted=accepted)
+    if is_anew:
+        init.create_state(place, generation, is_forced=force, is_settling=settle, accepted=accepted)
+    elif rejoin:
+        raise typer.Exit(recover.rejoin(place, manner, wanted))
+    else:
+        raise typer.Exit(recover.recover(place, manner, tuple(brought or ())))
+
+
 FLEET = new_group(
     "fleet",
     "The document that all nodes of the fleet go by.",
-    {"show": fleet.show, "export": fleet.export, "create": create},
+    {"show": fleet.show, "export": fleet.export, "create": create, "recover": recover_fleet},
 )

@@ -86,6 +86,7 @@ PauseAfterOption = Annotated[
 class Options:
     """A set of options: each annotated field is one. What a verb's first parameter is of."""
 
+    connect: str | None = None
     json_: bool = False
     revision: int | None = None
     accept: list[str] | None = None
@@ -109,18 +110,24 @@ class Options:
         }
 
 
-class Asks(Options):
-    """Which daemon is asked."""
+class Local(Options):
+    """Which daemon of this machine is asked."""
 
-    node: AskedOption = None
+    node: HereOption = None
     runtime_dir: RuntimeOption = None
-    connect: ConnectOption = None
 
     def door(self) -> Door:
         """To that daemon. Raises `CliError`: there is none."""
         from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
 
         return find_door(self.runtime_dir, self.node, connect=self.connect)
+
+
+class Asks(Local):
+    """Which daemon is asked, anywhere."""
+
+    node: AskedOption = None
+    connect: ConnectOption = None
 
 
 class Answers(Asks):
@@ -228,28 +235,25 @@ class _Spread:
     def __init__(self, verb: Callable[..., None]) -> None:
         functools.update_wrapper(self, verb)
         self._verb = verb
-
-    @functools.cached_property
-    def _set(self) -> tuple[str, type[Options], dict[str, inspect.Parameter]] | None:
-        """(the parameter's name, its set, the options)."""
-        first = next(iter(inspect.signature(self._verb, eval_str=True).parameters.values()))
-        kind = first.annotation
-        is_set = isinstance(kind, type) and issubclass(kind, Options)
-        return (first.name, kind, kind.parameters()) if is_set else None
+        self._set: tuple[str, type[Options]] | None = None
+        """(that parameter's name, the set), once typer has looked."""
 
     @functools.cached_property
     def __signature__(self) -> inspect.Signature:
-        """Made when it is asked for: of one verb, where one is named."""
+        """Made when typer asks for it: of one verb, where one is named."""
         whole = inspect.signature(self._verb, eval_str=True)
-        if self._set is None:
+        first, *others = whole.parameters.values()
+        kind = first.annotation
+        if not (isinstance(kind, type) and issubclass(kind, Options)):
             return whole
-        return whole.replace(parameters=[*list(whole.parameters.values())[1:], *self._set[2].values()])
+        self._set = first.name, kind
+        return whole.replace(parameters=[*others, *kind.parameters().values()])
 
     def __call__(self, **given: Any) -> None:
         """Run it."""
         if self._set is not None:
-            name, kind, options = self._set
-            given[name] = kind({option: given.pop(option) for option in options})
+            name, kind = self._set
+            given[name] = kind({option: given.pop(option) for option in kind.parameters()})
         self._verb(**given)
 
 

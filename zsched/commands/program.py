@@ -29,11 +29,16 @@ INSTEAD: Final = {
     "eligible": "zsched drain NODE --only new, or zsched undrain NODE",
     "replay": "zsched explain --replay FILE",
     "site": "zsched status --site",
+    "recover": "zsched fleet recover",
+    "rejoin": "zsched fleet recover --rejoin",
+    "init --generation": "zsched fleet recover --generation G",
+    "init --settle": "zsched fleet recover --settle",
+    "init --example": "zsched new KIND [DIR]",
     "maint": "zsched status, which tells every order",
     "remove": "zsched node remove NODE, or zsched task remove TASK",
 }
-"""{a word that is no verb: what to write}: words of other programs, and verbs of older ones."""
-DRASTIC: Final = frozenset({"init", "leave", "recover", "rejoin", "uninstall"})
+"""{words that are no verb, or none any more: what to write}: of other programs, and of older ones."""
+DRASTIC: Final = frozenset({"init", "leave", "uninstall"})
 """Verbs that are proposed to nobody who has written something else."""
 
 
@@ -54,6 +59,15 @@ class Program(Verbs):
         """All verbs, for the help."""
         own = super().list_commands(ctx)
         return [*own, *(name for name in installed_verbs() if name not in own)]
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """As typer's; a verb that had an option says what is written in its place."""
+        given = {word.partition("=")[0] for word in args[1:]}
+        for words, told in INSTEAD.items():
+            verb, _, option = words.partition(" ")
+            if option in given and args[0] == verb:
+                return verb, _refusing(verb, f"it has no {option}; write {told}", EXIT_USAGE), args[1:]
+        return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """One verb.

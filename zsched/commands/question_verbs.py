@@ -15,9 +15,8 @@ from zsched.commands.options import (
     AgeOption,
     Answers,
     Asks,
-    HereOption,
+    Local,
     NoColorOption,
-    RuntimeOption,
     TaskArgument,
     new_group,
 )
@@ -130,6 +129,7 @@ def _of_site(asked: Asks) -> tuple[Path | None, str | None]:
 
 
 def events(
+    asked: Local,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
     since: AgeOption = None,
     about: Annotated[
@@ -139,12 +139,9 @@ def events(
         str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")
     ] = None,
     json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
-    node: HereOption = None,
-    runtime_dir: RuntimeOption = None,
 ) -> None:
     """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.history import EventsView, duration_s, subject_of, types_of  # noqa: PLC0415 - as above
+    from zsched.commands.history import EventsView, duration_s, subject_of, types_of  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.history import events as show_events  # noqa: PLC0415 - as above
 
     of_task, of_node = (None, None) if about is None else subject_of(about)
@@ -156,7 +153,7 @@ def events(
         is_following=follow,
         is_json=json_,
     )
-    raise typer.Exit(show_events(find_door(runtime_dir, node), view))
+    raise typer.Exit(show_events(asked.door(), view))
 
 
 def wait(

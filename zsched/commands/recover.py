@@ -1,4 +1,4 @@
-"""`zsched recover` and `zsched rejoin`: show what would become of the fleet, ask, and do it.
+"""`zsched fleet recover`, also with --rejoin: show what would become of the fleet, ask, and do it.
 
 Knows: tables, dangers that are accepted by name, what comes next. Does not know: what speaks against it
 (`zsched.core.electorate.recovery`), files and sessions (`zsched.runtime.recovery`).
@@ -6,45 +6,22 @@ Knows: tables, dangers that are accepted by name, what comes next. Does not know
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from zsched import paths as places
-from zsched.commands.common import CliError, again, check_dangers, say, says_yes, warn
-from zsched.commands.here import own_name
+from zsched.commands.common import CliError, check_dangers, check_taken, confirm, say, warn
+from zsched.commands.init import Place
 from zsched.commands.orders import user_name
-from zsched.config.load import load_fleet, require_node
 from zsched.core.electorate.recovery import Danger, Recovery, consider
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import SAID_DIGITS, FleetValue
-from zsched.core.values.fleet import Fleet
-from zsched.core.values.model import NodeId, RegisterState
+from zsched.core.values.model import RegisterState
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import MAX_ASKER, shown
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.runtime import recovery as runtime
 
 DANGERS = tuple(danger.value for danger in Danger)
-
-
-class Place(Struct, frozen=True, kw_only=True):
-    """Which node it is, and where its files are."""
-
-    fleet: Fleet
-    node: NodeId
-    config: Path
-    folder: Path
-
-
-def place_of(config: Path | None, node: str | None, state_dir: Path | None) -> Place:
-    """The node that the options mean, or the environment. Raises `ConfigError`: the fleet file has no such node."""
-    file = places.config_path(config, os.environ)
-    fleet = load_fleet(file)
-    name = own_name(node)
-    require_node(fleet, name, file)
-    return Place(fleet=fleet, node=name, config=file, folder=places.state_folder(state_dir, os.environ))
 
 
 class Manner(Struct, frozen=True, kw_only=True):
@@ -70,12 +47,9 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
     say(_table(plan, draft))
     if manner.is_plan:
         return EXIT_WOULD_CHANGE
-    missing = [(danger, means) for danger, means in plan.dangers if danger.value not in manner.accepted]
-    if missing:
-        names = [part for danger, _ in missing for part in ("--accept", danger.value)]
-        lines = "\n".join(f"  {danger.value}: {means}" for danger, means in missing)
-        raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again(*names)}")
-    _confirm(manner, f"Make {place.node} the only elector of a new generation of {place.fleet.name}?")
+    check_taken([(danger.value, means) for danger, means in plan.dangers], manner.accepted)
+    question = f"Make {place.node} the only elector of a new generation of {place.fleet.name}?"
+    confirm(question, is_sure=manner.is_sure)
     state = runtime.recover(plan, place.config, place.folder, brought)
     before, after = plan.before, _value_of(state)
     _note(
@@ -103,7 +77,7 @@ def rejoin(place: Place, manner: Manner, wanted: str) -> int:
     say(f"{place.node}: follows {told}, and starts blank there; what it knew of its own generation is dropped")
     if manner.is_plan:
         return EXIT_WOULD_CHANGE
-    _confirm(manner, f"Let {place.node} change sides?")
+    confirm(f"Let {place.node} change sides?", is_sure=manner.is_sure)
     path, state = runtime.rejoin(place.fleet, place.node, place.folder, own, side)
     _note(place, state, f"rejoined generation {side.generation_id[:SAID_DIGITS]}{by}")
     say(f"{path}: blank state of {place.node}, which is to follow {side.generation_id[:SAID_DIGITS]}")
@@ -116,17 +90,6 @@ def _note(place: Place, state: DurableState, what: str) -> None:
     by = f"{user_name()}@{place.node}"[:MAX_ASKER]
     if trouble := runtime.note(place.folder, place.node, state, f"{by}: {what}", by):
         warn(trouble)
-
-
-def _confirm(manner: Manner, question: str) -> None:
-    """Let the operator decide; off a terminal it takes --yes."""
-    if manner.is_sure:
-        return
-    if not sys.stdin.isatty():
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{again('--yes')}")
-    sys.stdout.flush()
-    if not says_yes(question, sys.stderr):
-        raise CliError(EXIT_FAILED, "nothing was changed")
 
 
 def _value_of(state: DurableState) -> FleetValue:
@@ -177,7 +140,9 @@ def _next(plan: Recovery, value: FleetValue) -> str:
     others = [node.name for node in plan.document.nodes if node.name != value.recovered_by]
     lines = [f"{value.recovered_by} is the only elector of generation {named}", "next: start this daemon"]
     if others:
-        lines.append(f"then on each of {', '.join(others)}: stop zsched, `zsched rejoin {named}`, start it")
+        lines.append(
+            f"then on each of {', '.join(others)}: stop zsched, `zsched fleet recover --rejoin {named}`, start it"
+        )
         lines.append("for each of them that is lost for good: `zsched node forget NODE` here")
     if plan.document.is_auto:
         lines.append("electors are added by themselves once those nodes are back (`zsched fleet show`)")

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.options import Answers, AskedOption, JsonOption, Options, RuntimeOption, new_group
+from zsched.commands.options import Answers, AskedOption, JsonOption, Local, new_group
 
 KeyArgument = Annotated[
     str | None,
@@ -22,20 +22,18 @@ CountOption = Annotated[
 ]
 
 
-class Tap(Options):
+class Tap(Local):
     """Where samples are listened to, how many, and how they are shown."""
 
     json_: JsonOption = False
     count: CountOption = None
     node: AskedOption = None
-    runtime_dir: RuntimeOption = None
 
     def run(self, verb: str, key: str | None, window: float = 1.0, timeout: float | None = None) -> None:
         """Until there were enough, or Ctrl-C: that is how these verbs are meant to end."""
         from zsched.commands import stream  # noqa: PLC0415 - each verb imports what it needs
-        from zsched.commands.ask import find_door  # noqa: PLC0415 - as above
 
-        door, code = find_door(self.runtime_dir, self.node), 0
+        door, code = self.door(), 0
         view = stream.StreamView(door=door, is_json=self.json_, window_s=window, count=self.count, timeout_s=timeout)
         with contextlib.suppress(KeyboardInterrupt):
             code = stream.show_tail(view, key) if verb == "tail" else stream.show_rates(view, key, verb)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.options import Asks, HereOption, NoColorOption, RuntimeOption
+from zsched.commands.options import Asks, Local, NoColorOption
 
 
 def top(
@@ -88,6 +88,7 @@ def record(
 
 
 def trace(
+    asked: Local,
     otlp: Annotated[
         str, typer.Option("--otlp", metavar="URL", help="An OpenTelemetry collector (OTLP over HTTP).")
     ] = "http://127.0.0.1:4318",
@@ -95,18 +96,15 @@ def trace(
         str | None, typer.Option("--since", metavar="AGE", help="Also moves not older: 90s, 10m, 2h, 1d.")
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Only what the decision log holds, then end.")] = False,
-    node: HereOption = None,
-    runtime_dir: RuntimeOption = None,
 ) -> None:
     """Send a trace span for each move in this machine's decision log to an OpenTelemetry collector.
 
     Needs the extra trace. Exits with 1 when the collector refused one.
     """
-    from zsched.commands.ask import find_door  # noqa: PLC0415 - each verb imports what it needs
-    from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
+    from zsched.commands.history import duration_s  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.watch.trace import TraceView  # noqa: PLC0415 - as above
     from zsched.commands.watch.trace import trace as send  # noqa: PLC0415 - as above
 
     since_s = None if since is None else duration_s(since)
-    view = TraceView(find=lambda: find_door(runtime_dir, node), url=otlp, since_s=since_s, is_once=once)
+    view = TraceView(find=asked.door, url=otlp, since_s=since_s, is_once=once)
     raise typer.Exit(send(view))

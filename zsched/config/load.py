@@ -105,7 +105,7 @@ def _unread_hint(file: Path, error: OSError | ValueError) -> str:
         advice = "name the fleet file" if file == SYSTEM_CONFIG else "check the path"  # else somebody has named it
         return (
             f"{advice}; `zsched fleet create NAME` and `zsched join INVITATION` write this machine's, "
-            "`zsched init --example python` one to try"
+            "`zsched new python` one to try"
         )
     return "give the path of a fleet file"
 

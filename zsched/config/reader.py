@@ -335,7 +335,7 @@ def _compose(text: str, out: Collector) -> Node | None:
     else:
         if raw is not None:
             return _Conversion(out).node(raw, 0)
-        out.error(NOWHERE, "the file is empty", "`zsched init --example python` writes one that works")
+        out.error(NOWHERE, "the file is empty", "`zsched new python` writes one that works")
     return None
 
 

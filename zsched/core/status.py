@@ -58,7 +58,7 @@ DRASTIC_AFTER_S = 60.0
 
 A recovery beside electors that come back makes two fleets of one.
 """
-RECOVER = "stop zsched on one that has its state, run `zsched recover` there, and start it"
+RECOVER = "stop zsched on one that has its state, run `zsched fleet recover` there, and start it"
 NO_SPARE = "no other candidate can take it"
 HUNG_LEAST_S = 8.0
 """A job that takes `HUNG_TIMES` as long as jobs have taken may hang; one that takes less than this does not..."""
@@ -231,7 +231,7 @@ def _behind(node: Stages, now: float) -> Iterator[str]:
     """What brings nodes of several generations together again."""
     for name, (generation, since, _) in sorted(node.agreement.behind.items()):
         ours = node.agreement.generation or 0
-        command = f"`zsched init --generation {max(generation, ours)}`"
+        command = f"`zsched fleet recover --generation {max(generation, ours)}`"
         where = f"on {name}, with its daemon stopped: {command}"
         if generation > ours:
             where = f"stop this daemon, {command} here, start it; so on every node that is behind {name}"

@@ -192,8 +192,8 @@ def _register(task: str, statuses: Mapping[str, Json]) -> Iterator[Result]:
     if any(value[0] == newest[0] and value != newest for value in values):
         fix = (
             "two values of one revision: a state came from a backup or was made anew. What is agreed cannot be told "
-            "any more: stop every daemon, and run `sudo zsched init --generation G --force` on each, with G one above "
-            "the generation that `zsched status --json` tells (quorum)"
+            "any more: stop every daemon, and run `sudo zsched fleet recover --generation G --force` on each, with G "
+            "one above the generation that `zsched status --json` tells (quorum)"
         )
         yield failed(*told, fix=fix)
         return

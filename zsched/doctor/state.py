@@ -64,7 +64,7 @@ def makes_an_elector(scene: Scene) -> Result:
     if state.disputed:
         return failed(
             state.disputed,
-            fix="remove the other machine of this name, stop zsched here, then: zsched init --settle, and start it",
+            fix="remove the other machine of this name, stop zsched here, zsched fleet recover --settle, and start it",
         )
     if state.lost:
         return failed(str(state.lost), fix="zsched init --help says how this node becomes an elector again")

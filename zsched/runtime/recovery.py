@@ -1,4 +1,4 @@
-"""`zsched recover` and `zsched rejoin`: read the states that are there, ask the others, write the new state.
+"""`zsched fleet recover`, also with --rejoin: read the states that are there, ask the others, write the new state.
 
 Knows: state files and documents on disk, which nodes to ask. Does not know: what speaks against it
 (`zsched.core.electorate.recovery`), how it is shown and confirmed.

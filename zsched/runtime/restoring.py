@@ -60,8 +60,8 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
         generation = loaded.state.generation + 1
         why = (
             "the fleet file names another electorate than the state file, which is whole and stays; this node is "
-            f"no elector. If the file is right, give it to all, stop all, `zsched init --generation {generation} "
-            "--force` on each, and start all"
+            f"no elector. If the file is right, give it to all, stop all, `zsched fleet recover --generation "
+            f"{generation} --force` on each, and start all"
         )
         log.warning("other_electorate %s", why)
         return Restored(incarnation=incarnation, problem=why, is_foreign=True)

@@ -416,7 +416,7 @@ class Members:
                 self._init(machine)
 
     def settle_disputes(self) -> None:
-        """`zsched init --settle` where another machine had the name."""
+        """`zsched fleet recover --settle` where another machine had the name."""
         for name in self.names():
             machine = self.sim.machines[name]
             state = machine.disk.state

@@ -39,7 +39,7 @@ class Recoveries(Members):
     """Who comes and goes, and what survivors begin."""
 
     def recover(self) -> bool:
-        """`zsched recover` on one survivor, `zsched rejoin` on all others; whether there is a new generation."""
+        """`fleet recover` on one survivor, `fleet recover --rejoin` on the others; whether one has begun."""
         before = self.generation_id
         ours = [name for name in self.names() if self._generation(name) == before]
         done = self._begin_on_one_of(ours)
@@ -123,7 +123,7 @@ class Recoveries(Members):
         self._write_state(machine, state)
 
     def _bring_over(self, names: list[NodeId]) -> None:
-        """`zsched rejoin` on each of these, in some order."""
+        """`zsched fleet recover --rejoin` on each of these, in some order."""
         self.rng.shuffle(names)
         sides = self.sim.invariants.sides
         half = next((sides.get(one) for one in self.names() if self._generation(one) == self.generation_id), None)
@@ -153,7 +153,7 @@ class Recoveries(Members):
             self.sim.run(self.rng.choice((0.0, 0.3, 2.0)))
 
     def _bring_document(self, machine: Machine, told: tuple[Sides, ...], generation_id: str = "") -> None:
-        """`zsched rejoin` asks for it where the fleet file names nobody of the generation to follow."""
+        """`zsched fleet recover --rejoin` asks for it where the fleet file names nobody of the generation to follow."""
         wanted = generation_id or self.generation_id
         side = next((one for one in told if one.generation_id == wanted), None)
         judge = self.sim.documents.judge

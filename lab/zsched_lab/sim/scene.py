@@ -71,7 +71,7 @@ class Scene:
         self.initialised.clear()
 
     def bring(self, machine: Machine, generation: int) -> None:
-        """Stop a node, `zsched init --generation`, start it again if it ran; too late when a newer one has begun."""
+        """Stop a node, `fleet recover --generation`, start it again if it ran; too late when a newer one has begun."""
         if generation < self.generation:
             return
         is_up = machine.node is not None

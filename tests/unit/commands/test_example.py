@@ -1,4 +1,4 @@
-"""`zsched init --example`: what it writes, and that it overwrites nothing."""
+"""`zsched new`: what it writes, and that it overwrites nothing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def run(*arguments: object) -> Result:
 @pytest.mark.parametrize("example", Example)
 def test_an_example_is_written_whole_and_its_fleet_file_has_no_fault(tmp_path: Path, example: Example) -> None:
     folder = tmp_path / "new" / "task"
-    result = run("init", "--example", example, folder)
+    result = run("new", example, folder)
     assert (result.exit_code, result.stdout.splitlines()) == (0, [str(folder / name) for name in NAMES])
     assert sorted(path.name for path in folder.iterdir()) == NAMES
     checked = check_file(folder / "fleet.yaml")
@@ -36,7 +36,7 @@ def test_every_folder_of_examples_is_offered() -> None:
 
 def test_the_current_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run("init", "--example", "zenoh").exit_code == 0
+    assert run("new", "zenoh").exit_code == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == NAMES
 
 
@@ -46,7 +46,7 @@ def test_what_is_there_is_named_and_nothing_is_written(tmp_path: Path, is_link: 
         (tmp_path / "worker.py").symlink_to(tmp_path / "nowhere")
     else:
         (tmp_path / "worker.py").write_text("mine")
-    result = run("init", "--example", "python", tmp_path)
+    result = run("new", "python", tmp_path)
     assert result.exit_code == 1
     assert "has worker.py already" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["worker.py"]
@@ -55,22 +55,9 @@ def test_what_is_there_is_named_and_nothing_is_written(tmp_path: Path, is_link: 
 
 def test_a_folder_that_cannot_be_written_is_an_error_with_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    result = run("init", "--example", "python", tmp_path / "file" / "task")
+    result = run("new", "python", tmp_path / "file" / "task")
     assert result.exit_code == 1
     assert "cannot write" in result.stderr
-
-
-@pytest.mark.parametrize("more", [("--node", "robot1"), ("--force",), ("--generation", "1"), ("--config", "x.yaml")])
-def test_an_example_takes_no_options_of_a_state(tmp_path: Path, more: tuple[str, ...]) -> None:
-    result = run("init", "--example", "python", tmp_path / "task", *more)
-    assert result.exit_code == 2
-    assert not (tmp_path / "task").exists()
-
-
-def test_a_folder_without_an_example_is_refused(tmp_path: Path) -> None:
-    result = run("init", tmp_path)
-    assert result.exit_code == 2
-    assert "goes with --example" in result.stderr
 
 
 def test_the_application_is_the_same_for_both_zenoh_workers() -> None:

@@ -38,12 +38,13 @@ CHANGING = {
         "invite",
         "leave",
     ),
-    *("rehearse", "recover", "rejoin", "init", "join", "fleet create"),
+    *("rehearse", "fleet recover", "init", "join", "fleet create"),
 }
 OTHERS = {
     *(
         "up",
         "dev",
+        "new",
         "status",
         "top",
         "web",

@@ -418,8 +418,8 @@ def test_a_founder_that_lost_its_state_is_not_made_a_fleet_of_one(
         assert run("init", *words).exit_code == 0, "a fleet of one that is secured by hand"
         shutil.rmtree(tmp_path / "state")
         held.issue("robot2", Role.NODE, (), b"", b"", datetime.now(UTC))
-    for more in ((), ("--generation", "1")):
-        refused = run("init", *words, *more)
+    for verb in (("init",), ("fleet", "recover", "--generation", "1")):
+        refused = run(*verb, *words)
         assert (refused.exit_code, refused.stdout) == (1, "")
         told = " ".join(refused.stderr.split())
         assert f"nothing was written: {tmp_path}/fleet.yaml names nobody but robot1" in told

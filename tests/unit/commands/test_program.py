@@ -64,6 +64,7 @@ def test_nobody_takes_a_verb_of_the_program(monkeypatch: pytest.MonkeyPatch) -> 
         (("stauts", "--json"), "write zsched status"),
         (("weights", "echo", "cpu=1"), "write zsched tune TASK cpu="),
         (("site", "--json"), "write zsched status --site"),
+        (("rejoin", "8d3f"), "write zsched fleet recover --rejoin"),
         (("replay", "decisions.ndjson"), "write zsched explain --replay FILE"),
         (("fly",), "`zsched --help` lists them"),
         *(((near,), "") for near in ("recove", "rejion", "leav", "uninstal", "inti")),
@@ -76,6 +77,19 @@ def test_a_word_that_is_no_verb_leads_to_what_is_meant_to_nothing_drastic(words:
     said = " ".join(result.stderr.split())
     assert says in said
     assert not DRASTIC & set(said.split()), said
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("init", "--example", "python", "my-task"), "it has no --example; write zsched new KIND [DIR]"),
+        (("init", "--generation=1", "--force"), "it has no --generation; write zsched fleet recover --generation G"),
+        (("init", "--settle"), "it has no --settle; write zsched fleet recover --settle"),
+    ],
+)
+def test_an_option_that_has_another_verb_now_leads_there(words: tuple[str, ...], says: str) -> None:
+    result = run(*words)
+    assert (result.exit_code, result.stdout, result.stderr) == (2, "", f"zsched init: {says}\n")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`zsched recover` and `rejoin` at the command line: what is shown, asked and refused; states on disk are real."""
+"""`zsched fleet recover`, also with --rejoin: what is shown, asked and refused; states on disk are real."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from zsched.adapters.host import decision_log
 from zsched.adapters.host.state_file import StateFile
 from zsched.commands.common import CliError, Json
 from zsched.commands.history import changes_of
-from zsched.commands.recover import Manner, Place, recover, rejoin
+from zsched.commands.init import Place
+from zsched.commands.recover import Manner, recover, rejoin
 from zsched.config.load import load_fleet
 from zsched.core.values.durable import DurableState
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
@@ -177,7 +178,7 @@ def test_off_a_terminal_it_takes_yes_and_at_one_the_answer_counts(
     assert captured.out.splitlines()[-5:] == [
         f"robot1 is the only elector of generation {named}",
         "next: start this daemon",
-        f"then on each of robot2, robot3: stop zsched, `zsched rejoin {named}`, start it",
+        f"then on each of robot2, robot3: stop zsched, `zsched fleet recover --rejoin {named}`, start it",
         "for each of them that is lost for good: `zsched node forget NODE` here",
         "electors are added by themselves once those nodes are back (`zsched fleet show`)",
     ]
@@ -207,7 +208,7 @@ def test_another_half_is_a_danger_of_its_own(hall: Hall) -> None:
     accepted = Manner(is_sure=True, accepted=BOTH)
     _, text = refusal(lambda: recover(hall.place("robot1"), accepted, ()))
     assert "another-half: robot3 (5be01c77) count by another generation already" in text
-    assert "`zsched rejoin 5be01c77` brings this node over" in text
+    assert "`zsched fleet recover --rejoin 5be01c77` brings this node over" in text
 
 
 def test_a_node_changes_sides_by_word(hall: Hall, capsys: pytest.CaptureFixture[str]) -> None:

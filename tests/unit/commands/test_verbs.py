@@ -229,7 +229,8 @@ def test_check_of_thousands_of_rules_ends_in_seconds(tmp_path: Path) -> None:
 def test_init_creates_the_state_once(tmp_path: Path) -> None:
     file, state = tmp_path / "fleet.yaml", tmp_path / "state"
     file.write_text(FLEET)
-    arguments = ("init", "--config", file, "--node", "robot1", "--state-dir", state)
+    place = ("--config", file, "--node", "robot1", "--state-dir", state)
+    arguments, anew = ("init", *place), ("fleet", "recover", *place, "--generation", 1)
     first, second = run(*arguments), run(*arguments)
     assert first.exit_code == 0
     speed, path = first.stdout.splitlines()
@@ -237,19 +238,20 @@ def test_init_creates_the_state_once(tmp_path: Path) -> None:
     assert path == f"{state}/state: blank state of robot1 in fleet hall, generation 0"
     said = f"{state}: robot1 has its state in fleet hall, generation 0: nothing to do\n"
     assert (second.exit_code, second.stdout) == (0, said)
-    assert run(*arguments, "--generation", 1, "--force").exit_code == 0
+    assert run(*anew, "--force").exit_code == 0
     before = (state / "state").read_bytes()
-    for again in ((), ("--generation", 1)):
-        assert "generation 1: nothing to do" in run(*arguments, *again).stdout
+    for again in (arguments, anew):
+        assert "generation 1: nothing to do" in run(*again).stdout
     assert (state / "state").read_bytes() == before
 
 
-def test_init_of_a_new_generation_keeps_a_good_state_unless_told(tmp_path: Path) -> None:
+def test_a_new_generation_keeps_a_good_state_unless_told(tmp_path: Path) -> None:
     """Nobody answers here, so nobody says that the fleet needs a new generation."""
     file, state = tmp_path / "fleet.yaml", tmp_path / "state"
     file.write_text(FLEET)
-    arguments = ("init", "--config", file, "--node", "robot2", "--state-dir", state)
-    assert run(*arguments).exit_code == 0
+    place = ("--config", file, "--node", "robot2", "--state-dir", state)
+    arguments = ("fleet", "recover", *place)
+    assert run("init", *place).exit_code == 0
     before = (state / "state").read_bytes()
     refused = run(*arguments, "--generation", 1)
     assert (refused.exit_code, refused.stdout) == (1, "")
@@ -263,12 +265,31 @@ def test_init_of_a_new_generation_keeps_a_good_state_unless_told(tmp_path: Path)
     assert "which is newer than 1" in older.stderr
 
 
-def test_init_with_force_alone_is_a_usage_error(tmp_path: Path) -> None:
+def test_a_recovery_with_force_alone_is_a_usage_error(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET)
-    result = run("init", "--config", file, "--node", "robot1", "--state-dir", tmp_path / "state", "--force")
+    place = ("--config", file, "--node", "robot1", "--state-dir", tmp_path / "state")
+    result = run("fleet", "recover", *place, "--force")
     assert result.exit_code == 2
     assert "--generation" in result.stderr
+    assert not (tmp_path / "state").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--rejoin", "--settle"),
+        ("--generation", 1, "--settle"),
+        ("--generation", 1, "--plan"),
+        ("--settle", "--plan"),
+        ("8d3f",),
+        ("--rejoin", "--from", "state"),
+        ("--settle", "--from", "state"),
+    ],
+)
+def test_a_recovery_does_one_thing(tmp_path: Path, words: tuple[object, ...]) -> None:
+    result = run("fleet", "recover", "--state-dir", tmp_path / "state", *words)
+    assert (result.exit_code, result.stdout, " with" in result.stderr) == (2, "", True)
     assert not (tmp_path / "state").exists()
 
 
@@ -292,14 +313,16 @@ def test_init_of_a_secured_fleet_that_nobody_answers_for_warns_of_an_old_file(tm
     assert f"take {tmp_path / 'state' / 'state'} away, bring here what `zsched fleet export` writes" in told.stderr
 
 
-@pytest.mark.parametrize("more", [(), ("--generation", 1)], ids=["plain", "as the old advice had it"])
-def test_init_in_another_nodes_folder_says_whose_it_is_and_leaves_it(tmp_path: Path, more: tuple[object, ...]) -> None:
+@pytest.mark.parametrize(
+    "words", [("init",), ("fleet", "recover", "--generation", 1)], ids=["plain", "as the old advice"]
+)
+def test_init_in_another_nodes_folder_says_whose_it_is_and_leaves_it(tmp_path: Path, words: tuple[object, ...]) -> None:
     file, state = tmp_path / "fleet.yaml", tmp_path / "state"
     file.write_text(FLEET)
-    arguments = ("init", "--config", file, "--state-dir", state)
-    assert run(*arguments, "--node", "robot1").exit_code == 0
+    place = ("--config", file, "--state-dir", state)
+    assert run("init", *place, "--node", "robot1").exit_code == 0
     before = (state / "state").read_bytes()
-    result = run(*arguments, "--node", "robot2", *more)
+    result = run(*words, *place, "--node", "robot2")
     assert (result.exit_code, result.stdout) == (1, "")
     assert "belongs to the node 'robot1', not 'robot2', and is left as it is" in result.stderr
     assert "give robot2 a folder of its own with --state-dir, or say with --node robot1" in result.stderr

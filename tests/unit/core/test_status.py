@@ -154,7 +154,7 @@ def test_electors_that_have_lost_their_state_are_named_and_count_for_nothing() -
     hear_again(node)
     assert build_snapshot(node, LATE).problems[-1] == (
         "nothing can be agreed: too many electors without their states (each says why); "
-        "if these are lost, stop every daemon, run `zsched init --generation 1 --force` on every node, "
+        "if these are lost, stop every daemon, run `zsched fleet recover --generation 1 --force` on every node, "
         "and start them when all have it"
     )
     again = beat_of("robot2", incarnation=4)
@@ -172,7 +172,7 @@ def test_where_a_document_is_agreed_a_lost_majority_is_recovered_on_one_node() -
         problems = build_snapshot(node, LATE).problems
     assert problems[1].startswith("no quorum: 1 of 3 electors can answer, 2 needed")
     assert problems[2].startswith("nothing can be agreed: too many electors without their states (each says why); ")
-    assert problems[2].endswith("run `zsched recover` there, and start it")
+    assert problems[2].endswith("run `zsched fleet recover` there, and start it")
     assert not any("--generation" in one for one in problems)
 
 
@@ -190,7 +190,7 @@ def test_electors_are_waited_for_before_a_recovery_is_named() -> None:
         node.handle(ev.DeadlineReached(), 162.0)
         (told,) = (one for one in build_snapshot(node, 162.0).problems if one.startswith("no quorum"))
     assert told.startswith(f"{waiting}. Only for nodes that will never come back: stop zsched on one ")
-    assert told.endswith("run `zsched recover` there, and start it")
+    assert told.endswith("run `zsched fleet recover` there, and start it")
 
 
 def test_each_counter_of_what_was_refused_tells_when_it_rose_last() -> None:
@@ -320,7 +320,7 @@ def test_where_init_would_be_refused_it_is_not_advised(remembered: str) -> None:
         node.agreement.newest_generation = 1
     hear_again(node)
     told = build_snapshot(node, LATE).problems[-1]
-    assert "(each says why); if these are lost, stop every daemon, run `zsched init --generation" in told
+    assert "(each says why); if these are lost, stop every daemon, run `zsched fleet recover --generation" in told
     assert "No state file" not in told
 
 
@@ -423,7 +423,7 @@ def test_a_node_of_another_generation_is_told_with_the_command_that_mends_it() -
     said = build_snapshot(node, 100.0).problems
     assert any("robot2 is of generation 2, this node of 0" in one for one in said)
     assert not any("init" in one for one in said), "it may be about to be stopped"
-    ahead = "stop this daemon, `zsched init --generation 2` here, start it"
+    ahead = "stop this daemon, `zsched fleet recover --generation 2` here, start it"
     assert any(one.startswith(ahead) for one in build_snapshot(node, LATE).problems)
 
 

@@ -89,7 +89,7 @@ def test_the_application_is_started_by_one_line_from_any_folder(tmp_path: Path) 
 
 
 def test_a_folder_without_a_fleet_file_is_said(tmp_path: Path) -> None:
-    with pytest.raises(CliError, match=r"no fleet\.yaml in the folder .*zsched init --example python"):
+    with pytest.raises(CliError, match=r"no fleet\.yaml in the folder .*zsched new python"):
         dev(DevOptions(file=tmp_path, workers=()))
 
 
@@ -114,7 +114,7 @@ def test_a_worker_is_named_alone_or_with_its_task(tmp_path: Path, monkeypatch: p
 def test_without_a_file_it_says_how_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
-    with pytest.raises(CliError, match="zsched init --example python") as told:
+    with pytest.raises(CliError, match="zsched new python") as told:
         dev(DevOptions(file=None, workers=()))
     assert told.value.code == 78
 

@@ -100,7 +100,7 @@ def test_a_fleet_file_that_is_not_there_has_no_line_and_a_way_to_begin(tmp_path:
     scene.file.unlink()
     result = run("file.valid", replace(scene, reading=check_file(scene.file)))
     assert result.evidence == (f"{scene.file}: cannot be read: No such file or directory",)
-    for begin in ("zsched fleet create NAME", "zsched join INVITATION", "zsched init --example python"):
+    for begin in ("zsched fleet create NAME", "zsched join INVITATION", "zsched new python"):
         assert begin in result.fix
 
 

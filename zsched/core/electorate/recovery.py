@@ -170,7 +170,7 @@ def _why_no_one_generation(found: Found) -> str:
     if all(state.joins and state.fleet_register is None for state in found.states):
         return f"{first.node} was to join generation {named[:SAID_DIGITS]} and knows nothing of it yet: recover another"
     if found.own is not None and found.own.disputed:
-        return f"{found.own.disputed}; `zsched init --settle` comes first"
+        return f"{found.own.disputed}; `zsched fleet recover --settle` comes first"
     return ""
 
 
@@ -255,7 +255,7 @@ def _dangers(found: Found, before: FleetValue, strangers: Sequence[Snapshot]) ->
         told = ", ".join(f"{one.node} ({one.quorum.generation_id[:SAID_DIGITS] or 'older'})" for one in strangers)
         newest = next((one.quorum.generation_id for one in strangers if one.quorum.recovered_by), "")
         means = f"{told} count by another generation already, and this would be one more"
-        means += f"; `zsched rejoin {newest[:SAID_DIGITS]}` brings this node over" if newest else ""
+        means += f"; `zsched fleet recover --rejoin {newest[:SAID_DIGITS]}` brings this node over" if newest else ""
         dangers.append((Danger.HALF, means))
     return dangers
 
@@ -273,7 +273,7 @@ class Sides(Struct, frozen=True, kw_only=True):
 
     generation_id: str
     generation: int
-    """As operators count it (`zsched init --generation`)."""
+    """As operators count it (`zsched fleet recover --generation`)."""
     nodes: tuple[NodeId, ...]
     """Who has answered, sorted."""
     recovered_by: NodeId

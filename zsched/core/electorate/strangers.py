@@ -1,7 +1,7 @@
 """Nodes of this fleet that count by another generation: a half that was recovered apart, or that stayed behind.
 
 Nothing crosses generations by itself: no value, answer, beat or grant. A node changes sides only by its operator's word
-(`zsched rejoin`), and starts blank there. So both sides show the stranger, and the command that brings it over.
+(`zsched fleet recover --rejoin`), and starts blank there. So both sides show the stranger, and how it is brought over.
 
 Knows: which generation a beat or an answer names. Does not know: what becomes of a stranger's frames.
 """
@@ -113,8 +113,8 @@ class Strangers(Struct):
             node: (
                 f"{node} counts by another generation of this fleet, {_called(told, self._by.get(told, ''))}; this "
                 f"node by {here}; nothing passes between them. The side that has a quorum stays. To bring {node} over: "
-                f"`zsched rejoin {ours.generation_id[:SAID_DIGITS]}` there; only where this side has no quorum, to "
-                f"bring this node over: `zsched rejoin {told[:SAID_DIGITS]}` here"
+                f"`zsched fleet recover --rejoin {ours.generation_id[:SAID_DIGITS]}` there; only where this side has "
+                f"no quorum, to bring this node over: `zsched fleet recover --rejoin {told[:SAID_DIGITS]}` here"
             )
             for node, (told, _) in sorted(self._heard.items())
         }

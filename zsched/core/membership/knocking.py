@@ -79,8 +79,8 @@ class Knocking(Struct):
         return (
             f"{name} counts by another generation of this fleet, {generation[:SAID_DIGITS]}, and "
             f"{ours} does not name it; nothing passes between them. The side that has a quorum stays. To bring {name} "
-            f"over: `zsched node add` here, then `zsched rejoin` there; only where this side has no quorum, to bring "
-            f"this node over: `zsched rejoin {generation[:SAID_DIGITS]}` here"
+            f"over: `zsched node add` here, then `zsched fleet recover --rejoin` there; only where this side has "
+            f"no quorum, to bring this node over: `zsched fleet recover --rejoin {generation[:SAID_DIGITS]}` here"
         )
 
 

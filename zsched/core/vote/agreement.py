@@ -44,7 +44,7 @@ from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
 HELM_BALLOTS = 2
 """Each elector proposes a change of the electors so many times ``ballot_s`` after the one before."""
-SETTLE = "`zsched init --settle`, with its daemon stopped"
+SETTLE = "`zsched fleet recover --settle`, with its daemon stopped"
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
 

@@ -17,7 +17,7 @@ from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, NodeId
 
 GENERATION_STEP = 2**32
-"""Revision and epoch of generation G start at G times this (`zsched init --generation G`)."""
+"""Revision and epoch of generation G start at G times this (`zsched fleet recover --generation G`)."""
 MAX_GENERATION = MAX_REVISION // GENERATION_STEP - 1
 """The last one that leaves room to count: above `MAX_REVISION` nothing can follow (`Register`)."""
 MAX_AHEAD = 2**20

@@ -72,7 +72,7 @@ def blank_state(
 def way_out(generation: int) -> str:
     """The operator's steps from any mix of states to a fleet of one generation that agrees."""
     return (
-        f"stop every daemon, run `zsched init --generation {generation} --force` on every node, "
+        f"stop every daemon, run `zsched fleet recover --generation {generation} --force` on every node, "
         "and start them when all have it"
     )
 
@@ -119,8 +119,8 @@ def objection(
         again = f"To make it an elector again, {way_out(newest + 1)}"
         if any(answer.quorum.number for answer in current):
             again = (
-                "Where the fleet lives in several generations (`zsched status`), `zsched rejoin GENERATION` makes it a "
-                "new member of one. Where nothing can be agreed any more: zsched recover, on another one"
+                "Where `zsched status` tells of several generations, `zsched fleet recover --rejoin GENERATION` makes "
+                "it a new member of one. Where nothing can be agreed any more: zsched fleet recover, on another one"
             )
         return (
             f"{knows} knows {node} as an elector that has voted; a blank state would let it vote twice. Without a "
@@ -131,12 +131,12 @@ def objection(
         told = "; ".join(f"{name[:SAID_DIGITS]}: {one.node}" for name, one in sorted(named.items()))
         return (
             f"the fleet lives in several generations ({told}), and {node} has a seat in none: "
-            f"`zsched rejoin GENERATION` makes it a new member of one"
+            f"`zsched fleet recover --rejoin GENERATION` makes it a new member of one"
         )
     if newest > generation:
         return (
             f"{current[0].node} says that the fleet lives in generation {newest}; join it with "
-            f"`zsched init --generation {newest}`"
+            f"`zsched fleet recover --generation {newest}`"
         )
     if newest == generation:
         return None

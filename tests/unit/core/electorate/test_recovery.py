@@ -138,7 +138,7 @@ def carried_out(it: Found) -> tuple[DurableState, FleetValue]:
         ),
         (found(replace(state_of("robot2"), fleet="other"), own=state_of("robot1")), "is of the fleet other"),
         (found(own=replace(state_of("robot1", None), joins="77")), "robot1 was to join generation 77"),
-        (found(own=replace(state_of("robot1"), disputed="two of them")), "`zsched init --settle` comes first"),
+        (found(own=replace(state_of("robot1"), disputed="two of them")), "`zsched fleet recover --settle` comes first"),
         (
             found(own=state_of("robot1"), documents={"0d": fleet_of(TASK, of=ROBOTS[1:])}),
             "the agreed document names no node 'robot1'",
@@ -209,7 +209,7 @@ def test_a_document_that_is_nowhere_gives_way_to_the_file() -> None:
 def test_another_half_that_was_recovered_already_is_a_danger() -> None:
     half = replace(ADOPTED, generation_id="ab" * 16, recovered_by="robot3")
     told = dangers(found(own=state_of("robot1"), answers=(answer_of("robot3", half),)))
-    assert "`zsched rejoin abababab`" in told[Danger.HALF]
+    assert "`zsched fleet recover --rejoin abababab`" in told[Danger.HALF]
 
 
 # --- what it begins with ---------------------------------------------------------------------------------------------

@@ -117,8 +117,8 @@ def test_a_stranger_is_shown_with_whom_it_follows_and_what_brings_it_over() -> N
     shown = one.problems["generation", "robot3"]
     assert "robot3 counts by another generation of this fleet, bbbbbbbb (recovered by robot3)" in shown
     assert "this node by aaaaaaaa (recovered by robot1)" in shown
-    assert "`zsched rejoin aaaaaaaa` there" in shown
-    assert "`zsched rejoin bbbbbbbb` here" in shown
+    assert "`zsched fleet recover --rejoin aaaaaaaa` there" in shown
+    assert "`zsched fleet recover --rejoin bbbbbbbb` here" in shown
     assert not one.is_stranger(beat(LEFT, sequence=3), ToDo(), 110.1)
     assert ("generation", "robot3") not in one.problems
 

@@ -82,8 +82,8 @@ def test_a_first_state_is_refused_where_a_vote_is_remembered_or_the_fleet_is_fur
     assert "robot2 knows robot3 as an elector that has voted" in remembered
     ahead = why(0, says(), says("robot2", revision=2 * GENERATION_STEP + 1)) or ""
     voted = why(0, says("robot2", revision=2 * GENERATION_STEP + 1, voted=("robot3",))) or ""
-    assert "`zsched init --generation 3 --force` on every node" in voted, "no advice that is refused next"
-    assert "robot2 says that the fleet lives in generation 2; join it with `zsched init --generation 2`" in ahead
+    assert "`zsched fleet recover --generation 3 --force` on every node" in voted, "no advice that is refused next"
+    assert "the fleet lives in generation 2; join it with `zsched fleet recover --generation 2`" in ahead
 
 
 @pytest.mark.parametrize("forced", [False, True])
@@ -99,7 +99,7 @@ def test_where_electors_are_agreed_no_generation_by_hand_is_advised() -> None:
     agreed = replace(agreed, quorum=replace(agreed.quorum, number=4, names=("robot1", "robot2", "robot3")))
     told = why(0, agreed) or ""
     assert "would let it vote twice" in told
-    assert "`zsched rejoin GENERATION` makes it a new member" in told
+    assert "`zsched fleet recover --rejoin GENERATION` makes it a new member" in told
     assert "--generation" not in told
     assert why(0, replace(agreed, quorum=replace(agreed.quorum, names=("robot1", "robot2")))) is None, "it has no seat"
 
