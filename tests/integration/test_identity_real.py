@@ -112,7 +112,7 @@ def test_the_advice_of_init_leads_to_a_fleet_that_agrees(bed: Testbed) -> None:
     bed.kill("robot3")
     shutil.rmtree(bed.folder / "robot3")
     refused = init_that_says(bed, "knows robot3 as an elector that has voted", "robot3", bed.folder / "lost")
-    advice = re.search(r"stop every daemon, run `zsched init (.+)` on every node, and start them", refused.stderr)
+    advice = re.search(r"stop every daemon, run `zsched fleet recover (.+)` on every node, and start", refused.stderr)
     assert advice is not None, refused.stderr
     bed.stop()
     for node in bed.names:
@@ -141,7 +141,7 @@ def test_an_elector_of_another_generation_is_not_counted_and_comes_back_by_what_
 
     def told() -> re.Match[str] | None:
         said = "\n".join(bed.status("robot1")["problems"])
-        return re.search(r"stop this daemon, `zsched init (.+)` here, start it", said)
+        return re.search(r"stop this daemon, `zsched fleet recover (.+)` here, start it", said)
 
     advice = bed.wait(told, 90, "the advice, once it has been so for a minute")
     assert advice is not None

@@ -207,14 +207,14 @@ def have_electors(scene: Scene) -> Result:
     for name, status in sorted(scene.statuses.items()):
         quorum = status["quorum"]
         if name in electors and quorum["this_node"] != "elector":
-            fix = f"on {name}: zsched status says why; zsched init --help says what to do"
+            fix = f"on {name}: zsched status says why; zsched fleet recover --help says what to do"
             found.append(failed(f"{name} is an elector without a valid state ({quorum['this_node']})", fix=fix))
         for other in quorum["apart"]:
             fix = f"bring one fleet file to {name} and {other}; zsched status on both names the generation"
             found.append(failed(f"{name} and {other} refuse each other's votes", fix=fix))
         for other in quorum["stateless"]:
             if other not in scene.statuses:
-                fix = f"on {other}: zsched status says why; zsched init --help says what to do"
+                fix = f"on {other}: zsched status says why; zsched fleet recover --help says what to do"
                 found.append(warned(f"{name} says that {other} has lost its state", fix=fix))
     if scene.unseated:
         names = ", ".join(scene.unseated)

@@ -38,7 +38,7 @@ def valid(scene: Scene) -> Result:
     first = "before it, if the state was lost, bring what `zsched fleet export` writes on a living node as that file"
     fix = f"sudo zsched init --config {scene.file} --node {scene.node}, with the daemon stopped; {first}"
     if not found.is_missing:
-        fix = "zsched init --help says how a node becomes an elector again; do not copy a state from elsewhere"
+        fix = "zsched fleet recover --help says how a node becomes an elector again; do not copy a state from elsewhere"
     if found.is_others:
         fix = "the fleet file and name of that state, or zsched leave; zsched init refuses here"
     if scene.node not in scene.fleet.electors:
@@ -67,7 +67,7 @@ def makes_an_elector(scene: Scene) -> Result:
             fix="remove the other machine of this name, stop zsched here, zsched fleet recover --settle, and start it",
         )
     if state.lost:
-        return failed(str(state.lost), fix="zsched init --help says how this node becomes an elector again")
+        return failed(str(state.lost), fix="zsched fleet recover --help says how this node becomes an elector again")
     return passed(f"{scene.node} is one of {len(scene.fleet.electors)} electors, and its state is theirs")
 
 

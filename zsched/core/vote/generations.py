@@ -178,7 +178,7 @@ def lost_text(why: str, *, is_agreed: bool) -> str:
 
     ``is_agreed``: the fleet goes by an agreed document, in which another disk is another member.
     """
-    until = "a new generation (`zsched init --help`); it works all the same, and the fleet agrees without it if it can"
+    until = "a new generation (`zsched fleet recover --help`); it works all the same, and the fleet agrees if it can"
     if is_agreed:
         until = "it is added as one anew, which `electorate: auto` does by itself once its old seat is given up"
     return (

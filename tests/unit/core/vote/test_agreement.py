@@ -572,7 +572,7 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
     assert again.problems["state", ""].startswith(
         "peers remember 9 votes, here are 3: it was brought back from a backup"
     )
-    assert "zsched init --help" in again.problems["state", ""]
+    assert "zsched fleet recover --help" in again.problems["state", ""]
     kept = again.to_persist(100.0)
     assert kept is not None
     assert kept.lost == lost.lost
