@@ -11,7 +11,6 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TextIO
 
 from zsched import paths as places
 from zsched.commands.ask import Door
@@ -38,7 +37,7 @@ from zsched.commands.document import (
     status_of,
     wait_until_settled,
 )
-from zsched.commands.orders import asker
+from zsched.commands.orders import OrderView, asker
 from zsched.commands.page import cut
 from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
 from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors, warnings_in_force
@@ -61,30 +60,6 @@ OPEN_NETWORK = "open-network"
 DANGERS = (*(danger.value for danger in Danger), OTHER_FILES, OPEN_NETWORK)
 PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
-
-
-class ApplyView(Struct, frozen=True, kw_only=True):
-    """How a change is shown and confirmed."""
-
-    words: tuple[str, ...]
-    """The verb with its arguments, for the fleet's history."""
-    is_plan: bool = False
-    is_sure: bool = False
-    is_json: bool = False
-    accepted: tuple[str, ...] = ()
-    """Names of dangers."""
-    revision: int | None = None
-    """The only revision that may be changed; ``None``: whichever is in force."""
-    reason: str = ""
-    is_data: bool = False
-    """Stdout is for something else: messages go to stderr."""
-    pause_after: int | None = None
-    """The number of candidates of each task that run a changed worker while the others wait; ``None``: none waits."""
-
-    @property
-    def out(self) -> TextIO:
-        """Where messages go."""
-        return sys.stderr if self.is_data else sys.stdout
 
 
 class Plan(Struct, frozen=True, kw_only=True):
@@ -132,7 +107,7 @@ def read_text(file: str) -> str:
         raise ConfigError(f"{file}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8") from error
 
 
-def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str, part: Part | None = None) -> int:
+def apply(view: OrderView, make: Callable[[InForce], str], file: str, part: Part | None = None) -> int:
     """Plan the change that ``make`` makes of the document in force, show it, ask, have it agreed; the exit code.
 
     ``part``: what it adds, as its file has it.
@@ -143,11 +118,11 @@ def apply(door: Door, view: ApplyView, make: Callable[[InForce], str], file: str
     """
     check_dangers(view.accepted, DANGERS)
     check_reason(view.reason)
-    held = in_force(door)
-    return agree(door, view, make_plan(door, held, make(held), file, view, part))
+    held = in_force(view.door)
+    return agree(view, make_plan(view.door, held, make(held), file, view, part))
 
 
-def agree(door: Door, view: ApplyView, plan: Plan) -> int:
+def agree(view: OrderView, plan: Plan) -> int:
     """Show a plan, ask, have it agreed; the exit code.
 
     Raises:
@@ -167,12 +142,12 @@ def agree(door: Door, view: ApplyView, plan: Plan) -> int:
     if view.is_plan:
         return _tell(view, plan, "planned", held.revision, EXIT_WOULD_CHANGE)
     check_taken(plan.dangers, view.accepted)
-    confirm(f"Change {held.fleet} for all its nodes?", is_sure=view.is_sure, can_ask=view.words[-1] != STDIN)
-    return _commit(door, view, plan)
+    confirm(f"Change {held.fleet} for all its nodes?", is_sure=view.is_yes, can_ask=view.words[-1] != STDIN)
+    return _commit(view, plan)
 
 
 def make_plan(
-    door: Door, held: InForce, text: str, file: str, view: ApplyView | None = None, part: Part | None = None
+    door: Door, held: InForce, text: str, file: str, view: OrderView | None = None, part: Part | None = None
 ) -> Plan:
     """What ``text`` would change, and which dangers are in it; ``view`` says which changed workers wait for a look.
 
@@ -309,14 +284,15 @@ def _values(one: Change) -> str:
     return f"{before} -> {after}"
 
 
-def _tell(view: ApplyView, plan: Plan, outcome: str, revision: int, code: int) -> int:
+def _tell(view: OrderView, plan: Plan, outcome: str, revision: int, code: int) -> int:
     """The end of it, for people or as JSON."""
+    out = sys.stderr if view.is_data else sys.stdout
     if view.is_json:
         print_json(_body(plan, outcome, revision))
     elif outcome == "unchanged":
-        view.out.write(f"{plan.held.fleet}, revision {revision}: nothing would change\n")
+        out.write(f"{plan.held.fleet}, revision {revision}: nothing would change\n")
     elif outcome == "ok":
-        view.out.write(f"{plan.held.fleet}: revision {revision} is agreed\n")
+        out.write(f"{plan.held.fleet}: revision {revision} is agreed\n")
     return code
 
 
@@ -343,18 +319,18 @@ def _body(plan: Plan, outcome: str, revision: int) -> Json:
 # --- asking, and agreeing --------------------------------------------------------------------------------------------
 
 
-def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
+def _commit(view: OrderView, plan: Plan) -> int:
     """Have it agreed, one change after another, each on the revision that the one before made.
 
     An elector that leaves the fleet goes first: it would not take a document that does not name it. One that comes, or
     only ceases to be one, follows the document.
     """
-    steps = tuple(_steps(door, plan))
+    steps = tuple(_steps(view.door, plan))
     held, document = plan.held, plan.held.document
     for number, step in enumerate(steps):
         try:
             _check_same(held, document)
-            held = wait_until_settled(door, _agreed(door, step, held, view))
+            held = wait_until_settled(view.door, _agreed(step, held, view))
         except KeyboardInterrupt:
             warn(f"\n{number} of {len(steps)} changes are agreed, and the next one may be: give the command again")
             raise
@@ -367,16 +343,16 @@ def _commit(door: Door, view: ApplyView, plan: Plan) -> int:
     return _tell(view, plan, "ok", held.revision, EXIT_OK)
 
 
-def _agreed(door: Door, step: Json, held: InForce, view: ApplyView) -> int:
+def _agreed(step: Json, held: InForce, view: OrderView) -> int:
     """The revision that one change made.
 
     Raises:
         CliError: it is refused; somebody else was first, or the fleet does not come to rest.
     """
-    what = {**step, **ordered(shlex.join(view.words), {"by": asker(door), "reason": view.reason})}
+    what = {**step, **ordered(shlex.join(view.words), view.asked)}
     if "text" in step and view.revision is None:
-        return int(change_over(door, what, held)["revision"])
-    return int(change(door, {**what, "base_revision": held.revision})["revision"])
+        return int(change_over(view.door, what, held)["revision"])
+    return int(change(view.door, {**what, "base_revision": held.revision})["revision"])
 
 
 def _check_same(held: InForce, document: str) -> None:

@@ -28,6 +28,9 @@ IN_FORCE_S = 10.0
 """How long a change that is agreed is waited for at the node that was asked."""
 OVERTAKEN_S = 5.0
 """For this long a document is asked for while the fleet changes its electors by itself."""
+DOCUMENT = "the fleet's document"
+HERE = ("alive", "suspect")
+"""States of a node that is there."""
 CODES = {
     "ok": EXIT_OK,
     "unchanged": EXIT_OK,

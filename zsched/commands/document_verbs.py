@@ -41,9 +41,8 @@ def apply(
     from zsched.commands.apply import apply as change  # noqa: PLC0415 - each verb imports what it needs
     from zsched.commands.apply import read_text  # noqa: PLC0415 - as above
 
-    view, door = said.change("apply", file, pause_after=pause_after), said.door()
-    text = read_text(file)
-    raise typer.Exit(change(door, view, lambda _held: text, file))
+    view, text = said.order("apply", file, pause_after=pause_after), read_text(file)
+    raise typer.Exit(change(view, lambda _held: text, file))
 
 
 def edit(said: Edits, pause_after: PauseAfterOption = None) -> None:
@@ -53,4 +52,4 @@ def edit(said: Edits, pause_after: PauseAfterOption = None) -> None:
     """
     from zsched.commands.fleet import edit as open_document  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(open_document(said.door(), said.change("edit", pause_after=pause_after)))
+    raise typer.Exit(open_document(said.order("edit", pause_after=pause_after)))

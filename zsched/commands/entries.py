@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zsched.commands.apply import ApplyView, apply, read_text
-from zsched.commands.ask import Door
+from zsched.commands.apply import apply, read_text
 from zsched.commands.common import CliError, Json, nearest
-from zsched.commands.document import InForce, document_text, status_of
+from zsched.commands.document import DOCUMENT, HERE, InForce, document_text, status_of
+from zsched.commands.orders import OrderView
 from zsched.config.editing import add_entries, remove_node, remove_task
 from zsched.config.parts import Part
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 
-HERE = ("alive", "suspect")
 
-
-def add(door: Door, view: ApplyView, section: str, file: Path) -> int:
+def add(view: OrderView, section: str, file: Path) -> int:
     """Add the entries of ``file`` (a text with the one key ``section``) to the document; the exit code.
 
     Raises:
@@ -27,26 +25,23 @@ def add(door: Door, view: ApplyView, section: str, file: Path) -> int:
     """
     fragment = read_text(str(file))
     part = Part(section=section, text=fragment, file=str(file))
-    return apply(
-        door, view, lambda held: add_entries(document_text(held), section, fragment, str(file)), DOCUMENT, part
-    )
+    return apply(view, lambda held: add_entries(document_text(held), section, fragment, str(file)), DOCUMENT, part)
 
 
-def drop_task(door: Door, view: ApplyView, task: str) -> int:
+def drop_task(view: OrderView, task: str) -> int:
     """Take a task out of the document; the exit code.
 
     Raises:
         CliError, ConfigError: as of `apply`; or there is no such task (2).
     """
-    return apply(door, view, lambda held: remove_task(document_text(held), _known(door, task, "tasks")), DOCUMENT)
+    return apply(view, lambda held: remove_task(document_text(held), _known(view, task, "tasks")), DOCUMENT)
 
 
-def drop_node(door: Door, view: ApplyView, node: str, *, is_lost: bool) -> int:
+def drop_node(view: OrderView, node: str, *, is_lost: bool) -> int:
     """Take a node out of the document; the exit code.
 
     Args:
-        door: the daemon to ask.
-        view: how the change is shown and confirmed.
+        view: whom to ask, and how the change is shown and confirmed.
         node: which one.
         is_lost: it does not come back: only a node that is not there may be forgotten.
 
@@ -56,19 +51,16 @@ def drop_node(door: Door, view: ApplyView, node: str, *, is_lost: bool) -> int:
 
     def make(held: InForce) -> str:
         text = document_text(held)
-        status = status_of(door)
-        _known(door, node, "nodes", status)
+        status = status_of(view.door)
+        _known(view, node, "nodes", status)
         _check_may_go(held, status, node, is_lost=is_lost)
         return remove_node(text, node)
 
-    return apply(door, view, make, DOCUMENT)
+    return apply(view, make, DOCUMENT)
 
 
-DOCUMENT = "the fleet's document"
-
-
-def _known(door: Door, name: str, section: str, status: Json | None = None) -> str:
-    status = status_of(door) if status is None else status
+def _known(view: OrderView, name: str, section: str, status: Json | None = None) -> str:
+    status = status_of(view.door) if status is None else status
     names = [str(one["name"]) for one in status[section]]
     if name not in names:
         what = section.removesuffix("s")

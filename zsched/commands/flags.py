@@ -14,8 +14,7 @@ from typing import Any, Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, check_dangers, check_taken, nearest, print_json, say, told_task
-from zsched.commands.document import InForce, change_over, document_text, in_force, ordered
-from zsched.commands.entries import DOCUMENT
+from zsched.commands.document import DOCUMENT, InForce, change_over, document_text, in_force, ordered
 from zsched.commands.orders import (
     OrderView,
     Row,
@@ -59,8 +58,6 @@ class DrainOrder(Struct, frozen=True, kw_only=True):
     is_detached: bool = False
     deadline_s: float | None = 600.0
     """``None``: wait until they are empty."""
-    accepted: tuple[str, ...] = ()
-    """Names of dangers."""
     kind: str = DRAIN
     """``LEAVE``: they give up their seats among the electors, too. ``INELIGIBLE``: they keep what they own."""
     more_rows: tuple[Row, ...] = ()
@@ -104,7 +101,7 @@ def drain(view: OrderView, order: DrainOrder) -> int:
     after = _with(view, held, order.kind, nodes)
     rows = [_row(status, name, order.kind, after) for name in nodes]
     rows += [] if order.kind == INELIGIBLE else _task_rows(status, nodes, after)
-    danger = _check_dangers(view, order.accepted, status, held.flags, after)
+    danger = _check_dangers(view, status, held.flags, after)
     owned = [row[0] for row in rows if row[1] == "owner"]
     plan = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=danger)
     is_change = after != held.flags
@@ -287,15 +284,13 @@ def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tu
     return tuple(sorted(flags, key=lambda flag: (flag["subject"], flag["kind"])))
 
 
-def _check_dangers(
-    view: OrderView, accepted: Sequence[str], status: Json, before: Sequence[Json], after: Sequence[Json]
-) -> str | None:
+def _check_dangers(view: OrderView, status: Json, before: Sequence[Json], after: Sequence[Json]) -> str | None:
     """The danger that some task loses its last candidate that may get it, in words; a plan shows it.
 
     Raises:
         CliError: it is there, and is not accepted by name.
     """
-    check_dangers(accepted, (NO_OTHER,))
+    check_dangers(view.accepted, (NO_OTHER,))
     was, closed = ({flag["subject"] for flag in flags} for flags in (before, after))
     told = [
         str(task["name"])
@@ -308,7 +303,7 @@ def _check_dangers(
     if view.is_plan and not view.is_json:
         say(f"{NO_OTHER}: {means}")
     if not view.is_plan:
-        check_taken([(NO_OTHER, means)], accepted)
+        check_taken([(NO_OTHER, means)], view.accepted)
     return f"{NO_OTHER}: {means}"
 
 

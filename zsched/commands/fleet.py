@@ -15,11 +15,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from zsched.commands.apply import ApplyView, apply, read_text
+from zsched.commands.apply import apply, read_text
 from zsched.commands.ask import PASSES_ON, Door
 from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.commands.flags import SEAT_ADVICE, without_seat
+from zsched.commands.orders import OrderView
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.files import replace_regular
@@ -100,7 +101,7 @@ def export(door: Door, file: Path | None) -> int:
     return EXIT_OK
 
 
-def edit(door: Door, view: ApplyView, env: Mapping[str, str] = os.environ) -> int:
+def edit(view: OrderView, env: Mapping[str, str] = os.environ) -> int:
     """Open the document in the operator's editor and apply what comes of it; the exit code.
 
     What was typed and is not agreed stays in a file, which is named; Ctrl-C is no exception.
@@ -119,7 +120,7 @@ def edit(door: Door, view: ApplyView, env: Mapping[str, str] = os.environ) -> in
         return read_text(str(path))
 
     try:
-        code = apply(door, view, make, "the edited document")
+        code = apply(view, make, "the edited document")
     except KeyboardInterrupt:
         if (path := _edited(drafts)) is not None:
             warn(f"\nbroken off; your text is in {path}: zsched apply {shlex.quote(str(path))}")

@@ -42,7 +42,7 @@ def task_remove(
     """Take a task out of the document: its workers stop, its streams end (--accept remove-task)."""
     from zsched.commands.entries import drop_task  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(drop_task(said.door(), said.change("task", "remove", task), task))
+    raise typer.Exit(drop_task(said.order("task", "remove", task), task))
 
 
 def task_promote(
@@ -57,7 +57,7 @@ def task_promote(
     """
     from zsched.commands.promote import promote  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(promote(said.door(), said.change("task", "promote", *(tasks or ())), tasks or []))
+    raise typer.Exit(promote(said.order("task", "promote", *(tasks or ())), tasks or []))
 
 
 def node_add(
@@ -89,14 +89,14 @@ def node_forget(
 def _add(said: Changes, what: str, file: Path) -> None:
     from zsched.commands.entries import add  # noqa: PLC0415 - each verb imports what it needs
 
-    raise typer.Exit(add(said.door(), said.change(what, "add", str(file)), f"{what}s", file))
+    raise typer.Exit(add(said.order(what, "add", str(file)), f"{what}s", file))
 
 
 def _drop(said: Changes, name: str, *, is_lost: bool) -> None:
     from zsched.commands.entries import drop_node  # noqa: PLC0415 - each verb imports what it needs
 
-    view = said.change("node", "forget" if is_lost else "remove", name)
-    raise typer.Exit(drop_node(said.door(), view, name, is_lost=is_lost))
+    words = ("node", "forget" if is_lost else "remove", name)
+    raise typer.Exit(drop_node(said.order(*words), name, is_lost=is_lost))
 
 
 TASK = new_group(

@@ -19,8 +19,18 @@ from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
 from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, check_taken, say, warn
-from zsched.commands.document import QUESTION, UNKNOWING, InForce, ask_all, change, document_text, in_force, ordered
-from zsched.commands.entries import DOCUMENT, HERE
+from zsched.commands.document import (
+    DOCUMENT,
+    HERE,
+    QUESTION,
+    UNKNOWING,
+    InForce,
+    ask_all,
+    change,
+    document_text,
+    in_force,
+    ordered,
+)
 from zsched.commands.flags import (
     LEAVE,
     NO_OTHER,
@@ -164,7 +174,14 @@ def own_door(order: LeaveOrder, me: str) -> Door:
 
 def view_of(order: LeaveOrder, door: Door) -> OrderView:
     """The order as it goes to that daemon."""
-    return OrderView(door=door, is_json=order.is_json, is_yes=order.is_yes, is_plan=order.is_plan, reason=order.reason)
+    return OrderView(
+        door=door,
+        is_json=order.is_json,
+        is_yes=order.is_yes,
+        is_plan=order.is_plan,
+        reason=order.reason,
+        accepted=tuple(name for name in order.accepted if name == NO_OTHER),
+    )
 
 
 def _asked(
@@ -244,7 +261,6 @@ def _take_leave(way: Way, status: Json) -> int:
         nodes=(me,),
         kind=LEAVE,
         deadline_s=order.deadline_s,
-        accepted=tuple(name for name in order.accepted if name == NO_OTHER),
         more_rows=rows,
     )
     code = drain(way.view, drained)

@@ -138,7 +138,7 @@ def invite(
         authority=authority,
         request=csr,
     )
-    raise typer.Exit(bring(said.door(), said.change("invite", name, is_data=True), guest, output))
+    raise typer.Exit(bring(said.order("invite", name, is_data=True), guest, output))
 
 
 def join(

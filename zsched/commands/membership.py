@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Final
 
 from zsched import paths as places
-from zsched.commands.apply import ApplyView, apply
+from zsched.commands.apply import apply
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
 from zsched.commands.common import CliError, Json, again, check_name, nearest, print_json, say, uninterrupted, warn
-from zsched.commands.document import InForce, document_text, in_force, status_of
-from zsched.commands.entries import DOCUMENT, HERE
+from zsched.commands.document import DOCUMENT, HERE, InForce, document_text, in_force, status_of
+from zsched.commands.orders import OrderView
 from zsched.commands.papers import (
     FirstPapers,
     ask_for_certificate,
@@ -299,7 +299,7 @@ class Guest(Struct, frozen=True, kw_only=True):
     """For a key that was made on the machine itself."""
 
 
-def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
+def invite(view: OrderView, guest: Guest, file: Path | None) -> int:
     """Have a machine added to the document, and write the file with which it joins; the exit code.
 
     Raises:
@@ -313,7 +313,7 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
         raise CliError(EXIT_FAILED, f"{file}: that folder takes no file; nothing was done, name another one")
     if file is None and not view.is_plan:
         _close_to_others()  # before there is anything to read: who opens it now may read on when it is private
-    held = in_force(door)
+    held = in_force(view.door)
     fleet = fleet_of(document_text(held))
     check_held(fleet_of(document_text(held), str(places.config_path(None, os.environ))), guest.authority)
     check_request(fleet, guest.request, guest.authority)
@@ -324,16 +324,16 @@ def invite(door: Door, view: ApplyView, guest: Guest, file: Path | None) -> int:
     code = EXIT_OK
     listed = next((node for node in fleet.nodes if node.name == guest.name), None)
     if listed is not None:
-        _check_invited_again(door, guest, listed.kind)
+        _check_invited_again(view.door, guest, listed.kind)
         if fleet.security is not None and not set(former) <= set(fleet.security.revoked):
-            code = apply(door, view, lambda held: _without_keys(document_text(held), former), DOCUMENT)
+            code = apply(view, lambda held: _without_keys(document_text(held), former), DOCUMENT)
     else:
         address = None if guest.address is None else address_of(guest.address)
-        code = apply(door, view, lambda held: _without_keys(_with_guest(held, guest, address), former), DOCUMENT)
+        code = apply(view, lambda held: _without_keys(_with_guest(held, guest, address), former), DOCUMENT)
     if code != EXIT_OK:
         return code
     if not view.is_plan:
-        _write(invitation_for(door, guest, secret), guest, file)
+        _write(invitation_for(view.door, guest, secret), guest, file)
     return EXIT_OK
 
 

@@ -17,7 +17,6 @@ import typer
 from zsched.commands.common import Verb, Verbs
 
 if TYPE_CHECKING:
-    from zsched.commands.apply import ApplyView
     from zsched.commands.ask import Door
     from zsched.commands.orders import OrderView
     from zsched.doctor import look as doctor
@@ -143,8 +142,14 @@ class Consents(Answers):
     yes: YesOption = False
     reason: ReasonOption = ""
 
-    def order(self, for_: str | None = None) -> OrderView:
-        """An order; ``for_``: how long it holds. Raises `CliError`: that is no time, or no daemon is there."""
+    def order(
+        self, *words: str, for_: str | None = None, pause_after: int | None = None, is_data: bool = False
+    ) -> OrderView:
+        """The order, or the change of the document that ``words`` make; ``for_``: how long it holds.
+
+        Raises:
+            CliError: that is no time, or no daemon is there.
+        """
         from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
         from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
 
@@ -156,20 +161,8 @@ class Consents(Answers):
             reason=self.reason,
             revision=self.revision,
             for_s=None if for_ is None else duration_s(for_),
-        )
-
-    def change(self, *words: str, pause_after: int | None = None, is_data: bool = False) -> ApplyView:
-        """A change of the document; ``words``: the verb with its arguments, for the fleet's history."""
-        from zsched.commands.apply import ApplyView  # noqa: PLC0415 - as above
-
-        return ApplyView(
-            words=words,
-            is_plan=self.plan,
-            is_sure=self.yes,
-            is_json=self.json_,
             accepted=tuple(self.accept or ()),
-            revision=self.revision,
-            reason=self.reason,
+            words=words,
             is_data=is_data,
             pause_after=pause_after,
         )

@@ -155,10 +155,9 @@ def drain(
         is_self=self_,
         is_detached=detach or only is Only.NEW,
         deadline_s=None if force else duration_s(deadline),
-        accepted=tuple(said.accept or ()),
         kind=DRAIN if only is None else INELIGIBLE,
     )
-    raise typer.Exit(give(said.order(for_), order))
+    raise typer.Exit(give(said.order(for_=for_), order))
 
 
 def undrain(
@@ -189,7 +188,7 @@ def _hold(
 ) -> None:
     from zsched.commands.hold import HoldOrder, hold  # noqa: PLC0415 - as above
 
-    view = said.order(for_)
+    view = said.order(for_=for_)
     if tasks and is_all:
         raise CliError(EXIT_USAGE, "--all goes without tasks")
     order = HoldOrder(hold=verb, node=node, is_hard=is_hard, is_waiting=is_waiting)

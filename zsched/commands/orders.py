@@ -43,7 +43,16 @@ class OrderView(Struct, frozen=True, kw_only=True):
     is_plan: bool = False
     reason: str = ""
     revision: int | None = None
+    """The only one that may be changed; ``None``: whichever is in force."""
     for_s: float | None = None
+    accepted: tuple[str, ...] = ()
+    """Names of dangers."""
+    words: tuple[str, ...] = ()
+    """Of a change of the document: the verb with its arguments, for the fleet's history."""
+    is_data: bool = False
+    """Stdout is for something else: messages go to stderr."""
+    pause_after: int | None = None
+    """The number of candidates of each task that run a changed worker while the others wait; ``None``: none waits."""
 
     @property
     def asked(self) -> Json:

@@ -7,23 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from zsched.commands.apply import ApplyView, Plan, agree
-from zsched.commands.ask import Door
+from zsched.commands.apply import Plan, agree
 from zsched.commands.common import CliError, nearest
 from zsched.commands.document import document_text, in_force
+from zsched.commands.orders import OrderView
 from zsched.commands.rollout import promoted
 from zsched.config.load import check_bytes
 from zsched.core.values.struct import replace
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 
 
-def promote(door: Door, view: ApplyView, names: Sequence[str]) -> int:
+def promote(view: OrderView, names: Sequence[str]) -> int:
     """Let the changed workers of tasks go on to all nodes; without a task only show what waits; the exit code.
 
     Raises:
         CliError: nobody answers, a task is not there or does not wait, or the change is not agreed.
     """
-    held = in_force(door)
+    held = in_force(view.door)
     fleet = check_bytes(document_text(held).encode(), "the fleet's document").fleet
     if fleet is None:
         raise CliError(EXIT_FAILED, "the document in force has faults for this version of zsched; update zsched here")
@@ -43,6 +43,6 @@ def promote(door: Door, view: ApplyView, names: Sequence[str]) -> int:
         rollouts=tuple(one for one in held.rollouts if one["task"] not in chosen),
     )
     if names:
-        return agree(door, view, plan)
-    code = agree(door, replace(view, is_plan=True), plan)
+        return agree(view, plan)
+    code = agree(replace(view, is_plan=True), plan)
     return EXIT_OK if code == EXIT_WOULD_CHANGE and not view.is_plan else code

@@ -18,11 +18,10 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands import document, fleet
-from zsched.commands.apply import ApplyView
-from zsched.commands.ask import PASSES_ON, Door
+from zsched.commands.ask import PASSES_ON
 from zsched.commands.common import CliError
-from zsched.commands.document import InForce, in_force
-from zsched.commands.entries import DOCUMENT
+from zsched.commands.document import DOCUMENT, InForce, in_force
+from zsched.commands.orders import OrderView
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
@@ -618,8 +617,8 @@ def test_edit_keeps_what_was_typed_where_it_only_plans_or_is_broken_off(
     assert plan.stderr.endswith(f"your text is in {kept}; to have it agreed: zsched apply {kept}\n")
     kept.unlink()
 
-    def broken_off(door: Door, _view: ApplyView, make: Callable[[InForce], str], _file: str) -> int:
-        make(in_force(door))
+    def broken_off(view: OrderView, make: Callable[[InForce], str], _file: str) -> int:
+        make(in_force(view.door))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(fleet, "apply", broken_off)
