@@ -22,8 +22,8 @@ from zsched.core.values.struct import Struct, field
 
 SAME_WORTH: Final = 0.1
 """A promise is the same as long as it differs by at most this."""
-FAILED_S: Final = 60.0
-"""A machine that failed is not judged anew for so long."""
+LEASELESS_S: Final = 60.0
+"""A machine that had no lease for an exclusive task is not judged anew for so long."""
 
 
 class Kept(Struct):
@@ -79,14 +79,17 @@ class Kept(Struct):
                 self.seen[owner] = (self.foretold[owner], gave, now)
         self.foretold |= {name: value for name, value in worth.items() if name != owner or name not in self.foretold}
 
-    def fail(self, node: NodeId, now: float) -> None:
-        """The machine was left because it failed: it gave half of what it promised, or half of what it gave before."""
+    def fail(self, node: NodeId, now: float, for_s: float = 0.0) -> None:
+        """The machine was left because it failed: it gave half of what it promised, or half of what it gave before.
+
+        For the next ``for_s`` it is not judged anew: it looks as good as ever.
+        """
         if node in self.foretold:
             promised, gave, _ = self.seen.get(node, (self.foretold[node], self.foretold[node], now))
-            self.seen[node] = (promised, min(gave, promised) / 2.0, now + FAILED_S)
+            self.seen[node] = (promised, min(gave, promised) / 2.0, now + for_s)
 
     def has_failed(self, node: NodeId | None, now: float) -> bool:
-        """Whether that was less than `FAILED_S` ago."""
+        """Whether that is so still."""
         return node in self.seen and self.seen[node][2] > now
 
     def unkept(self, worth: Mapping[NodeId, float], memory_s: float, now: float) -> dict[NodeId, float]:

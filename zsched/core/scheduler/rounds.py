@@ -27,6 +27,7 @@ from zsched.core.scheduler.eligibility import NO_DOUBTS, Doubts, has_living_owne
 from zsched.core.scheduler.flags import NodeFlags
 from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
+from zsched.core.scheduler.kept import LEASELESS_S
 from zsched.core.scheduler.rest import Answers, is_like
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import Standing
@@ -471,6 +472,7 @@ class Rounds:
         left: NodeId | None,
         *,
         has_failed: bool,
+        lacks_lease: bool = False,
         now: float,
         was_draining: bool = False,
         is_escape: bool = False,
@@ -486,7 +488,7 @@ class Rounds:
         task = self.tasks[name]
         task.fuse.note_move(is_escape=has_failed or is_escape, now=now)
         if has_failed and not was_draining:
-            task.judge.kept.fail(left, now)
+            task.judge.kept.fail(left, now, LEASELESS_S if lacks_lease else 0.0)
 
     def forgive(self, name: TaskId, node: NodeId, now: float) -> None:
         """An operator has mended what was held against a node; judge again at once."""

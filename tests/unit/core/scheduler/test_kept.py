@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from zsched.core.gateway.demand import SETTLE_S
-from zsched.core.scheduler.kept import SAME_WORTH, Kept
+from zsched.core.scheduler.kept import LEASELESS_S, SAME_WORTH, Kept
 
 MEMORY_S = 1000.0
 HOME = {"edge1": 0.6, "edge2": 0.9}
@@ -109,9 +109,9 @@ def test_what_a_machine_gives_again_is_kept_anew_however_short_the_stay() -> Non
         assert worth_of_edge2(kept, at + 2.0) == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_machine_that_failed_is_not_judged_anew_for_a_minute() -> None:
+def test_a_machine_without_a_lease_is_not_judged_anew_for_a_minute() -> None:
     kept = gave((1.0 + SETTLE_S, 0.9))
-    kept.fail("edge2", 100.0)
+    kept.fail("edge2", 100.0, LEASELESS_S)
     assert (kept.has_failed("edge2", 159.0), kept.has_failed("edge2", 161.0)) == (True, False)
     for at in (101.0, 150.0):
         look(kept, {"edge1": 0.6, "edge2": 0.9}, "edge2", at)
