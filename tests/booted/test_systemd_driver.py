@@ -31,6 +31,7 @@ tasks:
   echo:
     candidates: {kind: edge}
     weights: {cpu: 1}
+    scheduling: {bonus: 0.5}
     worker: {driver: systemd, unit: echoer@.service, max_failures: 2, env: {GREETING: 'a "b" $HOME'}}
     inputs: [{from: "{robot}/in", to: "{target}/echo/{robot}/in"}]
     outputs: [{from: "{target}/echo/{epoch}/{robot}/out", to: "{robot}/out"}]

@@ -214,7 +214,8 @@ def test_what_an_owner_takes_with_it_is_counted(bench: Bench) -> None:
         until(lambda: bench.count().messages > 80 and bench.count().in_flight == 0, f"counted: {bench.count()}")
         count = bench.count()
         assert unaccounted(count) == 0
-        assert count.at_most_lost == 40
+        # of the samples that were put until one was answered the first ones may have gone to the first owner, too
+        assert 40 <= count.at_most_lost < 40 + count.messages - 80
         assert bench.find(SlotLost, task="t", epoch=1, owner="edge1", samples=40) is not None
         assert sorted(set(bench.back)) == [*range(40), 80]
 
