@@ -21,9 +21,10 @@ from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import document, messages, model
 from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.profile import DeviceSample, Profile
+from zsched.core.values.profile import DeviceSample, Profile, WorkerLoad, WorkerState
 from zsched.core.values.rehearsal import FAULTS, Strike
 from zsched.core.values.struct import Struct
+from zsched.core.values.words import Trouble
 from zsched.errors import WireError
 from zsched.ipc import pipe as relay_pipe
 from zsched.wire import codec as wire
@@ -478,3 +479,15 @@ def test_every_kind_is_a_frozen_value_with_bounded_size() -> None:
         assert bound <= wire.LARGE
         made: Any = cls  # typeshed does not know it as a dataclass
         assert all(field.default_factory is MISSING for field in fields(made))  # encode compares with `default` only
+
+
+def test_a_later_program_s_word_where_nothing_may_be_said_is_read_as_nothing() -> None:
+    told = wire.as_plain(WorkerLoad(task="merge", state=WorkerState.READY, trouble=Trouble.RESTS))
+    assert wire.from_plain({**told, "trouble": "sulks", "renewal": "some day"}, WorkerLoad) == WorkerLoad(
+        task="merge", state=WorkerState.READY
+    )
+    for word in (3, None, ["rests"]):
+        with pytest.raises(WireError, match="expected one of"):
+            wire.from_plain({**told, "trouble": word}, WorkerLoad)
+    with pytest.raises(WireError, match="expected one of"):
+        wire.from_plain({**told, "state": "sulking"}, WorkerLoad)
