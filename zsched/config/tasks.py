@@ -72,10 +72,9 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
             _advise_domain(task.worker, entry.value, out)
             _advise_gpu(task, entry.value, out)
             _advise_gpu_limit(task, entry.value, out)
-    for one in tasks:
-        for other in (name for name, _ in one.beside if name == one.name or name not in entries):
-            here: Section = entries[one.name].value.get("scheduling")  # type: ignore[union-attr]  # it has been read
-            out.error(here.place, f"{one.name} names {other!r}, which is no other task", nearest(other, tuple(entries)))
+            for other in (one for one, _ in task.beside if one == name or one not in entries):
+                place = entry.value.get("scheduling").place
+                out.error(place, f"{name} names {other!r}, which is no other task", nearest(other, tuple(entries)))
     split = frozenset(node.name for node in cast.nodes if node.local is not None)
     for conflict in rule_conflicts(tasks, cast.of_kind(NodeKind.ROBOT), split):
         _report(conflict, places, out)
