@@ -99,7 +99,7 @@ FLAG_BUGS: tuple[Bug, ...] = (
         "if change.owner in ():",
         _DOOR,
     ),
-    _bug("a drain waits for the cap", JUDGE, "owner is not None and not is_drain:", "owner is not None:", _JUDGE),
+    _bug("a drain waits for the cap", JUDGE, "owner is not None and not is_drain\n", "owner is not None\n", _JUDGE),
     _bug(
         "a drain is stronger than a hard pin",
         JUDGE,

@@ -15,12 +15,11 @@ from zsched.core.stages import UNREADY_SHOWN_S, Handler, PastValue, Stages, Unre
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Move
 from zsched.core.values.fleet import OnIsolation
-from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId, Weights, as_reason, told_by
+from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, Weights, as_reason, told_by
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.problems import Problem
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.quorum import majority
-from zsched.core.values.veto import Filter
 from zsched.core.values.words import CREATION_STEP, shown
 
 Why = str | None
@@ -53,7 +52,6 @@ def carry_out(node: Stages, value: Allocation, why: Why, todo: ToDo, now: float,
             task,
             left,
             has_failed=failed,
-            lacks_lease=_lacks_lease(node, value.task, left),
             was_draining=drained,
             is_escape=any(one.is_escape for one in _votes(node, value)),
             is_ordered=is_by_order or left in node.flags.drained,
@@ -177,7 +175,7 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     """
     if left is None or left == node.me:
         return False
-    votes, lacks_lease = _votes(node, value), _lacks_lease(node, value.task, left)
+    votes, lacks_lease = _votes(node, value), node.rounds.tasks[value.task].lacks_lease(left)
     is_escape, has_met = any(one.is_escape for one in votes), any(one.voter != node.me for one in votes)
     if not is_ours and not ((is_escape or lacks_lease) and has_met):
         return False
@@ -189,13 +187,6 @@ def _has_failed(node: Stages, value: Allocation, left: NodeId | None, now: float
     profile = node.gateway.fresh(left, now)
     # without a lease, it would come back with each of its links' good moments
     return lacks_lease or (profile is not None and profile.has_failed(value.task))
-
-
-def _lacks_lease(node: Stages, task: TaskId, left: NodeId | None) -> bool:
-    """Whether that kept the owner out when it was judged last."""
-    standing = node.rounds.tasks[task].standing
-    veto = None if standing is None or left is None else standing.vetoed.get(left)
-    return veto is not None and veto.filter in (Filter.LEASE, Filter.RESTS)
 
 
 def _told(weights: Weights) -> str:

@@ -181,7 +181,7 @@ class Judge:
         owner = allocation.owner
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
-        told = {name: value + head_starts.get(name, 0.0) for name, value in standing.aggregates.items()}
+        told = preferred(standing.aggregates, head_starts)
         self.kept.look(told, owner, now)
         worth = self.kept.corrected(told, owner, self.spec.memory_s, now)
         if owner in worth:
@@ -193,7 +193,7 @@ class Judge:
             if (leaving is None or name != owner) and (not allocation.is_bound or name in (home, owner))
         }
         self._watch_home(home in scored and home != owner and not self.kept.has_failed(home, now), now)
-        owed = self._charge(worth, min(0.0, *head_starts.values(), 0.0), owner, now)
+        owed = self._charge(worth, min((0.0, *head_starts.values())), owner, now)
         expected = {name: owed[name] for name in scored}
         winner = (
             home if home is not None and home in scored else pick({name: -one for name, one in expected.items()}, owner)
@@ -201,13 +201,11 @@ class Judge:
         if winner is None:
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
             return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
-        rests = any(name == owner and veto.filter is Filter.RESTS for name, veto in standing.vetoed.items())
+        rests = standing.kept_out_by(owner) is Filter.RESTS
         is_kept = home is not None and not rests and not (is_unheard and winner != home)
         outcome, reason = self._outcome(winner, expected, allocation, leaving, is_called, now, is_kept)
-        cap = None
-        if fuse is not None and owner is not None and not is_drain:
-            cap = self._cap(fuse, is_escape=escape is not None, now=now)
-        if outcome is Outcome.PROPOSE and cap is not None:
+        is_bounded = outcome is Outcome.PROPOSE and owner is not None and not is_drain
+        if is_bounded and fuse is not None and (cap := self._cap(fuse, is_escape=escape is not None, now=now)):
             outcome, reason = Outcome.WAIT, f"{reason}; {cap}"
         chosen = winner if outcome is Outcome.PROPOSE else owner
         return Judgement(
@@ -303,6 +301,11 @@ class Judge:
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} is worth most"
+
+
+def preferred(aggregates: Mapping[NodeId, float], head_starts: Mapping[NodeId, float]) -> dict[NodeId, float]:
+    """What machines are worth with what the file says of them: this is what they promise."""
+    return {name: value + head_starts.get(name, 0.0) for name, value in aggregates.items()}
 
 
 def _nobody(allocation: Allocation, why: str) -> str:

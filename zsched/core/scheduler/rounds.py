@@ -48,6 +48,7 @@ from zsched.core.values.model import (
     UtilityVector,
 )
 from zsched.core.values.struct import Struct
+from zsched.core.values.veto import Filter
 
 HEARD = (PeerState.ALIVE, PeerState.SUSPECT)
 FRESH_MARGIN_S = 0.001
@@ -94,6 +95,10 @@ class TaskRound:
     def __post_init__(self) -> None:
         self.file = self.spec
         self.rules = rules_of(self.spec)
+
+    def lacks_lease(self, node: NodeId) -> bool:
+        """Whether that kept a node out when the task was judged last."""
+        return self.standing is not None and self.standing.kept_out_by(node) in (Filter.LEASE, Filter.RESTS)
 
     def under(self, tuning: Tuning) -> None:
         """Judge from now on by the file's settings and this tuning."""
@@ -472,7 +477,6 @@ class Rounds:
         left: NodeId | None,
         *,
         has_failed: bool,
-        lacks_lease: bool = False,
         now: float,
         was_draining: bool = False,
         is_escape: bool = False,
@@ -488,7 +492,7 @@ class Rounds:
         task = self.tasks[name]
         task.fuse.note_move(is_escape=has_failed or is_escape, now=now)
         if has_failed and not was_draining:
-            task.judge.kept.fail(left, now, LEASELESS_S if lacks_lease else 0.0)
+            task.judge.kept.fail(left, now, LEASELESS_S if task.lacks_lease(left) else 0.0)
 
     def forgive(self, name: TaskId, node: NodeId, now: float) -> None:
         """An operator has mended what was held against a node; judge again at once."""

@@ -42,6 +42,11 @@ class Standing(Struct, frozen=True, kw_only=True):
     vectors: tuple[UtilityVector, ...]
     voters_heard: int
 
+    def kept_out_by(self, node: NodeId | None) -> Filter | None:
+        """Which filter keeps ``node`` out; ``None``: none does."""
+        veto = None if node is None else self.vetoed.get(node)
+        return None if veto is None else veto.filter
+
 
 def reaches_owner(spec: TaskSpec, allocation: Allocation, vectors: Mapping[NodeId, UtilityVector]) -> bool:
     """Whether the robots reach the task's owner, by the vectors that `compare` counts; false without an owner."""

@@ -138,6 +138,18 @@ def test_a_silent_robot_and_its_revision_are_told() -> None:
     assert told.changes == ("2 robots must tell their utilities, 1 did",)
 
 
+def test_what_was_not_kept_of_a_promise_that_holds_a_preference_is_told_as_it_was_judged() -> None:
+    """edge2 promised 0.9 with what the file adds, and gave 0.6."""
+    decision = decision_worth({"edge1": 0.5, "edge2": 0.4, "edge3": 0.3})
+    kept = KeptMemory(owner="edge1", seen=(("edge2", 0.9, 0.6, decision.figures.now),))
+    figures = replace(decision.figures, head_starts=(("edge2", 0.5),), judge=JudgeMemory(kept=kept))
+    again = judged_again(decision, figures)
+    (edge2,) = (one for one in explained(again).candidates if one.node == "edge2")
+    assert edge2.unkept == pytest.approx(0.3)
+    assert edge2.bonus == 0.5
+    assert edge2.total == pytest.approx(dict(again.verdict.aggregates)["edge2"])
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_candidate_leads_once_it_has_the_worth_that_it_is_told_to_lack(seed: int) -> None:
     worth = dict(
