@@ -83,36 +83,33 @@ def _node_fault(text: str) -> str | None:
 DRIVER_KEYS: Final = {
     "driver": Field(
         Choice.of(Driver),
-        "What keeps the worker: `process`: its `command`; `systemd`: a `unit` of the machine; `container`: an `image`; "
-        "`ros2_lifecycle`: a managed `node`, which its `command` starts.",
+        "What keeps the worker: its `command`, a `unit`, an `image`, or a managed `node` that its `command` starts.",
         default=f"`{Driver.PROCESS}`",
     ),
     "unit": Field(
         Here(Text("a systemd service", _unit_fault)),
-        "Driver `systemd`: the unit. Of a template, `NAME@.service`, the instance is NODE-TASK.",
+        "Driver `systemd`: the unit; of `NAME@.service` the instance NODE-TASK.",
     ),
     "image": Field(
         Text("an image", _image_fault),
-        "Driver `container`: the image. It must be on the machine: nothing is pulled.",
+        "Driver `container`: the image, which must be on the machine.",
     ),
-    "args": Field(
-        ListOf(Text("a word", _word_fault)), "Driver `container`: what runs inside, instead of the image's command."
-    ),
+    "args": Field(ListOf(Text("a word", _word_fault)), "Driver `container`: what runs inside."),
     "mounts": Field(
         ListOf(Text("a mount", _mount_fault)),
-        "Driver `container`: folders and files of the host, `/HOST:/INSIDE` or `/HOST:/INSIDE:ro`.",
+        "Driver `container`: `/HOST:/INSIDE` or `/HOST:/INSIDE:ro`.",
     ),
     "options": Field(
         ListOf(Text("an option", _option_fault)),
-        "Driver `container`: more options of `run`, one word each, as `--gpus=all`; the last of two counts.",
+        "Driver `container`: options of `run`, one word each, as `--gpus=all`.",
     ),
     "engine": Field(
         Choice.of(ContainerEngine),
-        "Driver `container`: what runs it; otherwise podman, and docker where there is no podman.",
+        "Driver `container`: what runs it; without the key podman, else docker.",
     ),
     "node": Field(
         Text("a managed node", _node_fault),
-        "Driver `ros2_lifecycle`: the node's full name, with `{target}` for the machine: `/{target}/slam`.",
+        "Driver `ros2_lifecycle`: the node's full name, as `/{target}/slam`.",
     ),
 }
 

@@ -75,7 +75,7 @@ def _action(service: Record) -> Record:
             ),
             "result_timeout_s": Field(
                 Number(0.05, _MAX_TIMEOUT_S, "s"),
-                "How long a goal may work: its result is asked for when it begins. `timeout_s` is of the other two.",
+                "How long a goal may work; `timeout_s` is of the other two services.",
                 default=f"`{_MAX_TIMEOUT_S:g}`",
             ),
             **rest,

@@ -132,9 +132,7 @@ TRACE: Final = Record(
 _LINK_FIELDS: Final = {
     "wifi": Field(_INTERFACE_NAME, "Read this interface's signal (nl80211, else /proc/net/wireless)."),
     "wired": Field(Flag(only=True), "A cable: the link counts 1."),
-    "fixed": Field(
-        Number(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm"), "A constant, for tests and for links that cannot be measured."
-    ),
+    "fixed": Field(Number(RSSI_MIN_DBM, RSSI_MAX_DBM, "dBm"), "A constant, for links that cannot be measured."),
     "trace": Field(TRACE, "Replay a recorded drive (lab and tests)."),
 }
 
@@ -144,7 +142,7 @@ PEER_LINK: Final = Record(
         **_LINK_FIELDS,
         "mac": Field(
             Text("a MAC address", _matches(_MAC, "six pairs of hex digits with ':' between")),
-            "The peer is this station of the node's `wifi` interface (ad hoc, mesh, or this node is the access point).",
+            "The peer is this station of the `wifi` interface (ad hoc, mesh, own access point).",
         ),
     },
 )
@@ -169,13 +167,13 @@ NODE: Final = Record(
                     ),
                     "streams": Field(
                         _ENDPOINT,
-                        "Where workers dial an application of this robot that uses `zsched.stream`; a fixed port.",
+                        "Where workers dial an application with `zsched.stream`; a fixed port.",
                     ),
                 },
             ),
-            "Where this node listens; the others find it by gossip from the seeds.",
+            "Where this node listens.",
         ),
-        "local": Field(LOCAL, "A network of its own for the host's applications: their keys stay on this machine."),
+        "local": Field(LOCAL, "A network for the host's applications alone."),
         "labels": Field(_LABELS, "Free pairs of text that `candidates` may ask for."),
         **_LINK_FIELDS,
         "links": Field(MapOf(NAME_BLOCK, PEER_LINK), "Links to single peers, where they differ from the node's own."),
@@ -195,16 +193,15 @@ _SHARE: Final = Number(0, 1)
 
 
 def _weight_told(gauge: Gauge) -> str:
-    unknown = "cannot have the task while another candidate has one" if gauge.is_needed else "counts 1"
+    unknown = "is out while another candidate has one" if gauge.is_needed else "counts 1"
     best, worst = gauge.shown(gauge.best), gauge.shown(gauge.worst)
-    return f"Weight of {gauge.says}: {best} is worth 1, {worst} nothing. A node without it {unknown}."
+    return f"Weight of {gauge.says}: {best} is worth 1, {worst} nothing; without it a node {unknown}."
 
 
 def _limit_told(gauge: Gauge) -> str:
     beyond, inside = ("below", "above") if gauge.is_floor else ("above", "below")
     back = f"{gauge.margin * 100:g} %" if not gauge.unit else f"{gauge.margin:g} {gauge.unit}"
-    owner = f"Limit of {gauge.says}. The owner is left {beyond} it"
-    return f"{owner}; a node gets the task from another one {back} {inside} it."
+    return f"Limit of {gauge.says}: the owner is left {beyond} it, another gets the task {back} {inside} it."
 
 
 WEIGHTS: Final = Record(
@@ -212,13 +209,10 @@ WEIGHTS: Final = Record(
     {
         "cpu": Field(
             _SHARE,
-            "Weight of the CPU: of the share of its work that the task gets done with it; with `score: paper` of what "
-            "is free (Eq. 1). All weights sum to 1.",
+            "Weight of the CPU.",
             default="`0`",
         ),
-        "memory": Field(
-            _SHARE, "Weight of the memory: likewise; with `score: paper` of what is free (Eq. 2).", default="`0`"
-        ),
+        "memory": Field(_SHARE, "Weight of the memory.", default="`0`"),
         "network": Field(_SHARE, "Weight of the radio link (Eq. 3).", default="`0`"),
         **{gauge.name: Field(_SHARE, _weight_told(gauge), default="`0`") for gauge in GAUGES},
     },
@@ -236,36 +230,34 @@ SCHEDULING: Final = Record(
     {
         "bonus": Field(
             _SHARE,
-            "Added to the owner's joint utility: what a move must gain.",
+            "What the owner is worth more.",
             default=f"`{DEFAULT_BONUS:g}`",
         ),
         "score": Field(
             Choice.of(ScoreForm),
-            "What a machine is worth to the task: `service`, the share of its work that the task would get done there; "
-            "`paper`, the free share of it once the task is there (Eq. 1, 2, 4).",
+            "A machine's worth: the share of its work that the task would get done there; `paper`: what is left free "
+            "(Eq. 1, 2, 4).",
             default=f"`{DEFAULT_SCORE}`",
         ),
         "objective": Field(
             Choice.of(Objective),
-            "What the task wants: `service`, as many of its jobs done as possible; `latency`, as many as possible "
-            "done within `deadline_ms` (a late one counts a tenth). With `score: service` only.",
+            "As many jobs as possible done, or done within `deadline_ms` (a late one counts a tenth; `score: service` "
+            "only).",
             default=f"`{Objective.SERVICE}`",
         ),
         "deadline_ms": Field(
             Number(MIN_DEADLINE_MS, MAX_DEADLINE_MS, "ms"),
-            "For `objective: latency`: a job that takes longer, from input to output and the network included, "
-            "comes too late. It counts for workers with the library, which tell how long their jobs take.",
+            "For `objective: latency`: the time of a job, network included; for workers with the library.",
             default="none",
         ),
         "aggregate": Field(
             Choice.of(Aggregate),
-            "How the robots' utilities become one; `median` resists a liar.",
+            "How the robots' words become one worth; `median` resists a liar.",
             default=f"`{Aggregate.MEAN}`",
         ),
         "prefer": Field(
             MapOf(Text("a node, or KEY=VALUE of a label"), _SHARE),
-            "How much more machines are worth, in the unit of `bonus`: `{edge1: 0.05}`, or `{gpu=yes: 0.1}` for all "
-            "with a label.",
+            "How much more machines are worth: `{edge1: 0.05}`, or `{gpu=yes: 0.1}` by a label.",
             default="none",
         ),
         "together": Field(
@@ -325,20 +317,18 @@ TASK: Final = Record(
         "candidates": Field(_NODES, "The nodes that may own the task: names, or a selection.", required=True),
         "weights": Field(
             WEIGHTS,
-            "How much CPU, memory, network and gauges count in a candidate's score; their sum is 1. Their terms are "
-            "multiplied, each to the power of its weight over the largest weight; with `score: paper` they are added, "
-            "each times its weight (Eq. 4).",
+            "How much CPU, memory, network and gauges count; their sum is 1.",
             required=True,
         ),
         "limits": Field(LIMITS, "How far a candidate's gauges may go."),
-        "demand": Field(DEMAND, "What the task needs at least; what is measured counts where it is more."),
+        "demand": Field(DEMAND, "What the task needs at least; where more is measured, that counts."),
         "scheduling": Field(SCHEDULING, "When a better candidate is worth a move."),
         "link": Field(LINK_LIMITS, "The limits of Eq. 3."),
         "worker": Field(WORKER, "The process that does the work."),
         "inputs": Field(ListOf(RULE), "Streams from the robots' applications to the owner's worker."),
         "outputs": Field(ListOf(RULE), "Streams from the owner's worker to the robots' applications."),
         "services": Field(ListOf(SERVICE), "Requests of the robots' applications that the owner's worker answers."),
-        "ros2": Field(ros2_record(RULE, SERVICE), "The same three by ROS 2 names; they become rules like the others."),
+        "ros2": Field(ros2_record(RULE, SERVICE), "The same by ROS 2 names."),
         **keys(TaskSpec, "on_isolation", "exclusive", "drain_s"),
     },
 )
@@ -367,13 +357,12 @@ SECURITY: Final = Record(
         ),
         "orders": Field(
             ListOf(Here(NAME_BLOCK)),
-            "Nodes that may give commands, besides operators; of the others no node takes one.",
+            "The only nodes that may give commands, besides operators.",
             default="every node",
         ),
         "signatures": Field(
             Choice.of(Signatures),
-            "Signatures on votes, learnt values and commands: a frame without one is dropped (`required`), or taken "
-            "while some nodes do not sign yet (`offered`); `off`: nobody signs.",
+            "Signatures on votes, learnt values and commands; `offered`: unsigned frames are taken.",
             default="`required`",
         ),
     },
@@ -382,12 +371,8 @@ SECURITY: Final = Record(
 CELL: Final = Record(
     "a cell",
     {
-        "gateways": Field(
-            _ENDPOINTS, "Control endpoints of two nodes of that fleet; they are tried in this order.", required=True
-        ),
-        "file": Field(
-            _FILE, "Its fleet file, relative to this one; needed where it is secured, for its certificates' folder."
-        ),
+        "gateways": Field(_ENDPOINTS, "Control endpoints of two of its nodes, tried in this order.", required=True),
+        "file": Field(_FILE, "Its fleet file, relative to this one; needed where it is secured."),
     },
 )
 
@@ -403,23 +388,19 @@ FLEET: Final = Record(
         "tasks": Field(MapOf(NAME_BLOCK, TASK), "What must run somewhere, and its streams."),
         "electorate": Field(
             Forms(word=Choice({"auto": ()}), listing=_NAMES, mapping=SELECTOR),
-            "Who stores the allocations and agrees on them; `auto`: the robots at first (where there is none, all "
-            "nodes), and who follows an elector that is gone is agreed, once there is a document (`zsched apply`).",
+            "Who agrees and stores what is agreed; `auto`: at first the robots (all nodes where there is none), which "
+            "are replaced when they are gone.",
             default="`auto`",
         ),
         "zenoh": Field(
             Record(
                 "a zenoh section",
-                {
-                    "config": Field(
-                        _FILE, "JSON5 file of settings of zenoh, relative to the fleet file; `check` judges it."
-                    )
-                },
+                {"config": Field(_FILE, "JSON5 file of zenoh's settings, relative to the fleet file.")},
             ),
             "Settings of zenoh itself.",
         ),
-        "site": Field(MapOf(NAME_BLOCK, CELL), "The other fleets of the site, by their names; verbs ask them, too."),
-        "security": Field(SECURITY, "Certificates of the fleet's own authority: only its members are let in."),
+        "site": Field(MapOf(NAME_BLOCK, CELL), "The other fleets of the site."),
+        "security": Field(SECURITY, "Only holders of certificates of the fleet's authority are let in."),
         **keys(Fleet),
     },
 )
@@ -472,14 +453,15 @@ def _section(record: Record, paths: list[str], before: dict[str, list[str]]) -> 
     rows = []
     for name, item in record.items.items():
         takes = _KEYS_BELOW.sub("a mapping", item.block.says()).replace("a number ", "")
-        rows.append(f"| `{name}` | {takes} | {'required' if item.required else item.default} | {item.doc} |")
+        default = "required" if item.required else item.default
+        rows.append(f"| `{name}` | {takes}{f' ({default})' if default else ''} | {item.doc} |")
     model = max(before, key=lambda name: len(set(before[name]) & set(rows)), default="")
     shared = [row for row in rows if row in before.get(model, ())]
     before[heading] = rows
     if len(shared) < MANY:
         shared = []
     own = [row for row in rows if row not in shared]
-    table = ("| key | takes | default | meaning |", "| --- | --- | --- | --- |", *own) if own else ()
+    table = ("| key | takes (default) | meaning |", "| --- | --- | --- |", *own) if own else ()
     names = ", ".join(row.split(" | ")[0].removeprefix("| ") for row in shared)
     more = ((f"\nAnd as in {model}: {names}." if own else f"As in {model}: {names}."),) if shared else ()
     return "\n".join((f"### {heading}\n", *table, *more, ""))

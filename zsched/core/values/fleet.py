@@ -165,37 +165,34 @@ class WorkerSpec:
 
     command: tuple[str, ...] = key(
         (),
-        "Program and arguments, no shell. A first word `python` is the daemon's own interpreter. "
-        "Absent: the worker is started by somebody else.",
+        "Program and arguments, no shell; `python` is the daemon's own. Absent: somebody else starts the worker.",
     )
-    standby: Standby = key(
-        Standby.WARM, "`warm`: runs on every candidate; `cold`: started on the move, by its `command`."
-    )
+    standby: Standby = key(Standby.WARM, "`warm`: runs on every candidate; `cold`: starts with the move.")
     ready_when: ReadyWhen = key(
         ReadyWhen.TOKEN,
-        "`token`: zsched.worker says so; `matching`: any zenoh program, while it takes every input and service.",
+        "`token`: the library says so; `matching`: while any zenoh program takes every input and service.",
         name="ready",
     )
     link: WorkerLink = key(WorkerLink.PEER, "How workers join the data network.")
     env: tuple[tuple[str, str], ...] = key((), "Environment.")
     user: str = key(
         "",
-        "As whom the worker runs on its machine, where systemd's `zsched-worker@USER.socket` is enabled.",
+        "As whom the worker runs, where `zsched-worker@USER.socket` is enabled.",
         shown="`zsched-worker`, where the service starts workers",
     )
     start_deadline_s: float = key(
         20.0,
-        "Ready within this time, or the start has failed. The worker of an owner may be away for this time; for less "
-        "where absences before, less a tenth of the time between them, come to more than it.",
+        "Ready within this time, or the start has failed; an owner's worker may be away for so long, in short "
+        "absences together.",
         SECONDS,
     )
-    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL, but for the daemon's own end.", SECONDS)
+    stop_grace_s: float = key(2.0, "Between SIGINT, SIGTERM and SIGKILL; not at the daemon's own end.", SECONDS)
     output_deadline_s: float | None = key(
-        None, "No output for this long while inputs flow counts as hung.", SECONDS, shown="by the task's rhythm"
+        None, "No output for so long while inputs flow: it is started again.", SECONDS, shown="by the task's rhythm"
     )
-    max_failures: int = key(3, "This many failures in the window make the node ineligible.", Range(1, 100))
+    max_failures: int = key(3, "So many failures in the window make the worker *failed*.", Range(1, 100))
     failure_window_s: float = key(
-        60.0, "The window; failures since it was last ready count however old.", Range(1, 86400, "s")
+        60.0, "The window; failures since it was last ready always count.", Range(1, 86400, "s")
     )
 
 
@@ -216,14 +213,14 @@ class LinkLimits:
 
     nu_dbm: float = key(
         -80.0,
-        "Least usable signal (Eq. 3): below it the candidate's utility is 0. While the robots reach the owner (by "
-        "`reach`), and for 3 s after that, others count as reached from 3 dB above it on (`score: service`).",
+        "Least usable signal (Eq. 3): below it a candidate is worth nothing; while the owner is reached, others need 3 "
+        "dB more.",
         DBM,
     )
     rho_dbm: float = key(-40.0, "Best achievable signal (Eq. 3); above `nu_dbm`.", DBM)
     pair: PairReading = key(
         PairReading.CANDIDATE,
-        "Worth of a link through an access point: by the candidate's way (as printed), or by the weaker one.",
+        "Through an access point a link counts by the candidate's way, or by the weaker one.",
     )
 
 
@@ -249,40 +246,35 @@ class TaskSpec:
     reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate, of the robots that answer.")
     memory_floor_ratio: float = key(
         0.05,
-        "Where a task leaves less memory free than this share, its memory counts up to 15 % less; "
-        "`score: paper` has no floor.",
+        "Where the task leaves less memory free, memory counts up to 15 % less; not with `score: paper`.",
         Range(0, MAX_FLOOR),
     )
     cpu_floor_ratio: float = key(
         0.0,
-        "Where a task leaves less CPU free than this share, the machine's CPU counts up to 15 % less: for programs "
-        "there that are no tasks, such as a robot's SLAM. `0`: by what the task itself gets. Not with `score: paper`.",
+        "The same of CPU: room for programs that are no tasks, such as a robot's SLAM.",
         Range(0, MAX_FLOOR),
     )
     price_s: float = key(
         0.3,
-        "What a move costs, in seconds of the task's work: it moves once staying has lost so much more than the other "
-        "machine would have. `0`: it follows the first lead that is seen.",
+        "What a move costs, in seconds of the task's work: the task moves once its machine owes so much more.",
         Range(0, MAX_PRICE_S, "s"),
     )
     max_moves_per_minute: int = 6
     """A fuse, whatever the figures say; no file sets it."""
-    memory_s: float = key(1000.0, "Half of what is held against a machine is forgotten in it.", Range(1, 86400, "s"))
+    memory_s: float = key(1000.0, "In it half of what is owed, or was not kept, is forgotten.", Range(1, 86400, "s"))
     priority: int = key(
         0,
-        "Where CPU is short: what tasks of less priority use on a machine counts as free, and beside one of more "
-        "priority the task counts on no fair share.",
+        "CPU that tasks of less priority use counts as free.",
         Range(-100, 100),
     )
     prefer: Readings = ()
     """(node, how much more it is worth), sorted; labels are resolved by `zsched.config.tasks`."""
     beside: Readings = ()
     """(task, how much more the machine that it is on is worth; less than 0: it is worth less), sorted."""
-    on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off from the owner.")
+    on_isolation: OnIsolation = key(OnIsolation.HOLD, "What a robot does that is cut off: wait, or work alone.")
     exclusive: bool = key(
         False,
-        "Only an owner with a lease works; needs `{epoch}` in every output's `from`. "
-        "A task that has worked without it rests until all its candidates have answered by this file.",
+        "Only an owner with a lease works; needs `{epoch}` in every output's `from`.",
     )
     drain_s: float = key(2.0, "How long the old owner may finish what it has in work.", Range(0, 600, "s"))
     worker: WorkerSpec = WorkerSpec()
@@ -344,7 +336,7 @@ class Timing:
     """In which a second observer may confirm, too."""
     zenoh_lease_s: float = key(1.5, "zenoh's own lease.", SECONDS)
     sample_s: float = key(0.2, "Period of the profilers.", SECONDS)
-    smoothing_s: float = key(0.3, "Time constant of CPU and memory, and of dBm where it is over 0.5 s.", SECONDS)
+    smoothing_s: float = key(0.3, "Time constant of CPU and memory; of dBm at least 0.5 s.", SECONDS)
     publish_s: float = key(1.0, "Longest time between two profiles.", SECONDS)
     """Sooner on change."""
     profile_ttl_s: float = key(3.0, "An older profile does not count.", SECONDS)
@@ -458,14 +450,12 @@ class Fleet:
     """Whether electors are replaced by themselves (`electorate: auto`, or none named) once a document is agreed."""
     replace_s: float = key(
         10.0,
-        "An elector that is not heard for this long is replaced, where the electors are not named and a document is "
-        "agreed (`zsched apply`).",
+        "After this silence an elector is replaced, where the document names none.",
         Range(1, 3600, "s"),
     )
     away_s: float = key(
         60.0,
-        "A robot that the electors have not heard for this long does not count in votes until it is heard again; "
-        "at least `replace_s`. Only where a document is agreed.",
+        "After this silence a robot does not count in votes, where a document is agreed; at least `replace_s`.",
         Range(1, 604800, "s"),
     )
     seeds: tuple[NodeId, ...] = ()
@@ -475,9 +465,7 @@ class Fleet:
     """``None``: there is no `security:` section."""
     cells: tuple[Cell, ...] = ()
     """Sorted by name; the other fleets of the site, which agree on nothing with this one."""
-    relay_orphan_s: float = key(
-        10.0, "How long a relay carries the streams on when its daemon is gone; 0: not at all.", Range(0, 600, "s")
-    )
+    relay_orphan_s: float = key(10.0, "How long a relay carries the streams on without its daemon.", Range(0, 600, "s"))
     """The next daemon takes the relay over."""
     shared_memory: SharedMemory = key(
         SharedMemory.OFF, "Large payloads within a machine; `auto`: where the node finds it fit."

@@ -65,7 +65,7 @@ class StreamSettings:
 
     stream_class: StreamClass = key(StreamClass.BEST_EFFORT, "What the stream needs.", name="class")
     keep_last: int = key(
-        1, "Samples per key and publisher that a new owner gets at once (class `latest`).", Range(0, 1000)
+        1, "Class `latest`: samples per key and publisher that a new owner gets at once.", Range(0, 1000)
     )
     depth: int = key(16, "Samples that may wait between subscriber and publisher.", Range(1, 100_000))
     handover: HandoverRule = key(
@@ -75,13 +75,13 @@ class StreamSettings:
         None, "Highest rate per key; not for `reliable`.", Range(0.01, 10_000, "Hz"), shown="no limit"
     )
     """The rest is dropped, the newest of class ``latest`` never."""
-    mirror: bool = key(False, "Inputs: feed both owners during a move (outputs with handover `latest` only).")
+    mirror: bool = key(False, "Inputs: feed both owners during a move (outputs with `handover: latest`).")
     graph: RosGraph = RosGraph.NONE
     """Set by the fleet file's `ros2:` sections."""
     on_crash: OnCrash = key(
         OnCrash.REPORT,
-        "Inputs of class `reliable`: what a dead owner had not acknowledged is reported (done at most once), "
-        "or replayed to the next owner (at least once).",
+        "Inputs of class `reliable`: samples that a dead owner had not acknowledged are reported (done at most once) "
+        "or replayed (at least once).",
     )
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class ServiceSettings:
     The default is what a killed owner's takeover may take at most with the profile ``wifi``, 1.8 s, and an exclusive
     task's lease on top (docs/design/timing.md).
     """
-    max_pending: int = key(16, "Requests at the owner at one time; the next one is answered `busy`.", Range(1, 256))
+    max_pending: int = key(16, "Requests at the owner at one time; then `busy`.", Range(1, 256))
 
     def __post_init__(self) -> None:
         check_ranges(self)
