@@ -190,26 +190,6 @@ def test_key_table_is_the_code_s() -> None:
     assert dict(rows) == rendered_keys()
 
 
-# --- architecture.md -------------------------------------------------------------------------------------------------
-
-
-def miscounted_walks(text: str) -> list[str]:
-    """Walks whose number of files is not that of their table's first column."""
-    found = []
-    for walk in text.partition("## Three walks")[2].partition("\n## ")[0].split("\n### ")[1:]:
-        cells = [line.split(" | ")[0] for line in walk.splitlines() if line.startswith("| `")]
-        files = {name for cell in cells for name in re.findall(r"`([\w/]+\.py)`", cell)}
-        if re.findall(r"^(\d+) files\b", walk, re.MULTILINE) != [str(len(files))]:
-            found.append(f"{walk.splitlines()[0]}: {len(files)}")
-    return found
-
-
-def test_the_walks_of_the_architecture_count_their_files() -> None:
-    text = text_of("docs/design/architecture.md")
-    assert miscounted_walks(text) == []
-    assert len(miscounted_walks(re.sub(r"^\d+ files", "1 files", text, flags=re.MULTILINE))) == 3
-
-
 # --- wire.md ---------------------------------------------------------------------------------------------------------
 
 
