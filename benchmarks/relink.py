@@ -3,7 +3,7 @@
 Two equal fleets of plain zenoh sessions with our control settings, each in network namespaces of its own, are split in
 halves at the same moments; they differ in ``transport/unicast/open_timeout``. A split is a little longer than zenoh's
 lease, so that a redial's first SYN is lost and TCP's next one, a second later, gets through: a dial that is given up at
-that very moment can leave a link that sends, never reads, and keeps all others out (decision 0025). A link is dead when
+that very moment can leave a link that sends, never reads, and keeps all others out (decision 0036). A link is dead when
 nothing has come by it 8 s after the split has healed; both fleets are then made anew. Needs root.
 """
 

@@ -26,7 +26,7 @@ def share_heaps() -> None:
 
 
 def give_back() -> None:
-    """Give freed pages back to the kernel: imports and a session's opening leave more than a megabyte (decision 0081).
+    """Give freed pages back to the kernel: imports and a session's opening leave more than a megabyte (decision 0049).
 
     Takes about a millisecond; call it once all is made.
     """

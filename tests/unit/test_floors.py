@@ -80,14 +80,14 @@ IMPURE_CALLS: Final = frozenset({"open", "print", "input", "exec", "eval", "comp
 HEAVY: Final = frozenset(
     {
         *("numpy", "cv2", "matplotlib", "onnxruntime", "rich", "pydantic", "asyncio"),
-        *("psutil", "pyroute2", "rosbags", "scipy", "skimage"),  # decisions 0010 and 0042
+        *("psutil", "pyroute2", "rosbags", "scipy", "skimage"),  # decision 0042
     }
 )
 OUTSIDE: Final[dict[str, str]] = {
     # library: who alone may import it, besides lab and tasks
     "zenoh": r"(adapters\.network|relay|stream|worker|sessions)(\..+)?|drivers\.ros2_lifecycle",
     "msgpack": r"wire\.codec",
-    "msgspec": r"core\.values\.struct",  # makes classes, reads and writes nothing (decision 0091)
+    "msgspec": r"core\.values\.struct",  # makes classes, reads and writes nothing (decision 0042)
     "ruamel": r"config\.(reader|editing)",
     "typer": r"cli|commands\..+",
     "mcap": r"commands\.watch\.record",  # an extra

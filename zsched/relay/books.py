@@ -4,7 +4,7 @@ Knows: one file in the runtime folder, written with every count that differs. Do
 
 A relay that is killed has no last word: what it had in hand by its books, its successor counts as at most lost. The
 books go with the last relay of a service that stops, and with the machine's memory: then all counters begin with 0
-(docs/decisions/0109-the-books-outlive-a-relay.md).
+(docs/decisions/0109).
 """
 
 from __future__ import annotations

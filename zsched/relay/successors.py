@@ -5,7 +5,7 @@ what is carried meanwhile.
 
 A successor is the same user's, of the same fleet and node, was started later (its incarnation is higher), and has the
 same protocol, Python and session on the host's own side: anything else makes a new relay necessary. Its code may be
-another version's, and its data session another one where the host has a side of its own (docs/decisions/0071).
+another version's, and its data session another one where the host has a side of its own (docs/decisions/0103).
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ WORKERS_BY: Final = "unixsock-stream"
 LOOPBACK_LISTEN: Final = "tcp/127.0.0.1:0"
 
 OPEN_TIMEOUT_S: Final = 1.5
-"""How long zenoh tries one dial: well between the times at which TCP sends a lost packet again (decision 0025).
+"""How long zenoh tries one dial: well between the times at which TCP sends a lost packet again (decision 0036).
 
 When it ends just as the handshake succeeds, zenoh drops the dial half done: a link that sends, never reads, never ends,
 and keeps every other link to the same peer out. A redial into a cut that has healed meanwhile succeeds with TCP's next
@@ -325,7 +325,7 @@ def daemon_pools(nodes: int) -> str:
     """The value of ``ZENOH_RUNTIME`` for a daemon with links to this many nodes (zenoh reads it once).
 
     What receives, transmits, closes links and shakes hands shares one pool: with a pool each, every packet wakes twice
-    as many threads (decision 0060). Closing a link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, and
+    as many threads (decision 0016). Closing a link that is dead one way holds a thread for zenoh's SO_LINGER, 10 s, and
     a stalled peer holds one that transmits: so there is one for every link, and `TX_THREADS`. A daemon's frames are
     small; large values starve behind one pool, so relays and workers have their own.
     """

@@ -758,7 +758,7 @@ def test_a_task_whose_jobs_wait_for_each_other_comes_to_rest(
 ) -> None:
     """A quick machine far away keeps the deadline, and by its short queue the slow one nearby would keep it as well.
 
-    By the owner's queue alone the examples are limit cycles of 19 to 38 moves in 400 s (docs/decisions/0139).
+    By the owner's queue alone the examples are limit cycles of 19 to 38 moves in 400 s (docs/decisions/0118).
     """
     near = replace(QUEUES, queueing=queueing)
     far = replace(near, name="edge2", speed=speed, signal_dbm=far_dbm)

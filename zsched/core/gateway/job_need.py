@@ -6,7 +6,7 @@ Knows: work and waits of a job, what of a time was which. Does not know: what a 
 Jobs that come irregularly wait for each other, and the more of its time a worker is busy the longer, by more than the
 time of a job: ``u / (1 - u)`` times it, and some factor for how irregular they are (Kingman 1961, "The single server
 queue in heavy traffic"). That factor is the task's, and what it is seen to be on its owner counts on every machine. A
-queue that was taken along as it is would make a slow machine look as quick as its owner (docs/decisions/0139).
+queue that was taken along as it is would make a slow machine look as quick as its owner (docs/decisions/0118).
 """
 
 from __future__ import annotations

@@ -379,7 +379,7 @@ class Timing:
         """How many signs of life a data session sends in one ``zenoh_lease_s``, where it sends nothing else: 3 or 4.
 
         A frozen worker's link may end one period of these signs before its lease is over, but not before ``lease_s``:
-        what the worker might still send must be past its lease by then (decision 0111).
+        what the worker might still send must be past its lease by then (decision 0100).
         """
         longest_s = self.zenoh_lease_s - self.lease_s  # between two signs
         return FEWEST_SIGNS if longest_s * FEWEST_SIGNS >= self.zenoh_lease_s - 1e-9 else MOST_SIGNS

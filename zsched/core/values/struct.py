@@ -1,7 +1,7 @@
 """The base of the house's values: typed fields, compared and shown field by field.
 
 A `Struct` is msgspec's, written in C: a class is made thirty times as fast as a dataclass, a value five times
-(`docs/decisions/0091-structs.md`). `dataclasses.fields`, `is_dataclass` and ``replace`` take it as well. Type checkers
+(`docs/decisions/0042`). `dataclasses.fields`, `is_dataclass` and ``replace`` take it as well. Type checkers
 see `msgspec.Struct` and the typed `dataclasses.replace`. Does not know: any value.
 """
 
