@@ -16,14 +16,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import zenoh
 
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
-from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.outputs import OutputStream
 from zsched.relay.streams.receive import undeclare
 from zsched.sessions.config import data_config, worker_config
@@ -139,7 +138,7 @@ def outward(relay: zenoh.Session, stream_class: StreamClass) -> Way:
     assert feed is not None
 
     def sent() -> bool:
-        queue = cast("Outlet", stream._outlet)._queue  # noqa: SLF001 - how far its queue is
+        queue = stream._outlet._queue  # noqa: SLF001 - how far its queue is
         return queue is None or (not queue._items and queue._busy_since is None)  # noqa: SLF001
 
     return lambda sample: stream._carry(feed, sample), sent, stream.close  # noqa: SLF001

@@ -356,7 +356,7 @@ class Daemon:
             door=self._door,
             orphan_s=fleet.relay_orphan_s,
             incarnation=incarnation,
-            digest=" ".join((self._spec.listen_streams, *(() if self._spec.local else self._watch.gossiped))),
+            digest=" ".join(() if self._spec.local else self._watch.gossiped),
             listen=points.data_listen[0],
             certificate="" if fleet.security is None else digest_of(fleet.security),
             tasks=tasks,
@@ -378,7 +378,6 @@ class Daemon:
             local_config=zenoh_config.local_config(side, timing=fleet.timing) if (side := self._spec.local) else "",
             silence_s=max(SILENCE_S, fleet.timing.zenoh_lease_s + 0.5),
             bequest=bequest if fleet.relay_orphan_s > 0 else None,
-            streams=self._streams(),
         )
 
     def _data_listen(self, points: Endpoints) -> tuple[str, ...]:
@@ -398,12 +397,6 @@ class Daemon:
         if not listen.is_everywhere:
             return points.data_listen
         return tuple(str(listen.at(host)) for host in (here.host, *gossiped) if host)
-
-    def _streams(self) -> tuple[Path, str] | None:
-        """The socket for an application that has its streams itself, and where that listens."""
-        if not self._spec.listen_streams:
-            return None
-        return places.streams_path(self._options.runtime_dir, self._spec.name), self._spec.listen_streams
 
     def _supervisor(
         self, stack: contextlib.ExitStack, shell: Shell, incarnation: int, points: Endpoints

@@ -132,19 +132,6 @@ def socket_path(runtime: Path, node: NodeId) -> Path:
     return runtime / f"{node}.sock"
 
 
-def streams_path(runtime: Path, node: NodeId) -> Path:
-    """The socket at which one node's relay tells an application of streams that it has itself."""
-    return runtime / f"{node}.streams"
-
-
-def local_streams(runtime: Path) -> tuple[Path, ...]:
-    """Every such socket in the folder, sorted."""
-    try:
-        return tuple(sorted(runtime.glob("*.streams")))
-    except PermissionError:
-        return ()
-
-
 def again_path(runtime: Path, node: NodeId) -> Path:
     """The mark of a daemon on this machine that begins again in its process, until its operator socket is there."""
     return runtime / f"{node}.again"

@@ -222,41 +222,6 @@ def test_a_saved_worker_is_started_again_and_a_broken_one_leaves_the_owner_its_o
         assert run.left() == []
 
 
-OWN_STREAMS = """
-from threading import Event
-from zsched.stream import Streams
-
-answered = Event()
-with Streams.join(node="robot1", wait_s=30.0) as streams:
-    streams.subscribe("robot1/answer", lambda answer: answered.set())
-    questions = streams.publisher("robot1/question")
-    for _ in range(300):
-        questions.put("hello")
-        if answered.wait(0.2):
-            print("answered", flush=True)
-            break
-"""
-
-
-def test_an_application_has_its_streams_itself_in_a_terminal_of_the_run(folder: Path) -> None:
-    write_example(Example.PYTHON, folder)
-    file = folder / "fleet.yaml"
-    data = 'data: "tcp/0.0.0.0:7458"'
-    file.write_text(file.read_text().replace(data, f'{data}, streams: "tcp/0.0.0.0:7459"', 1))
-    program = folder / "own.py"
-    program.write_text(OWN_STREAMS)
-    with dev(folder) as run:
-        enter = run.wait(r"source (\S+)\n")[1]
-        run.wait(r'itself by[^`]*`Streams\.join\(node="robot1"\)`')
-        run.wait(r"shout: on (\w+) \(epoch 1")
-        script = f"source {enter} && exec {shlex.quote(sys.executable)} {shlex.quote(str(program))}"
-        ended = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=120, check=False)
-        assert (ended.returncode, ended.stdout) == (0, "answered\n"), ended.stderr
-        run.process.send_signal(signal.SIGTERM)
-        assert run.process.wait(END_S) == 0
-        assert run.left() == []
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_at_any_time_leaves_nothing(folder: Path, number: signal.Signals) -> None:
     write_example(Example.ZENOH, folder)

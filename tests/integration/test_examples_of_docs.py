@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from support.waiting import free_endpoint, until
+from support.waiting import until
 from zsched_lab.fleet.hall import Hall, block_of_ports
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
@@ -86,19 +86,6 @@ def test_a_worker_of_the_documents_answers_the_application_of_the_documents(
         # the first ones may be put before the relay's subscription is known to the application
         assert said == [text.upper() if is_loud else text for text in QUESTIONS][-len(said) :]
         assert len(said) >= len(QUESTIONS) - 2
-
-
-@pytest.mark.long
-def test_the_application_with_its_own_streams_is_answered(tmp_path: Path) -> None:
-    tree = fleet_of(tmp_path, *worker_of("docs/guide/worker.md", 0))
-    tree["nodes"]["robot1"]["listen"]["streams"] = free_endpoint()
-    with Testbed(tmp_path, tree) as bed:
-        bed.init()
-        bed.start()
-        assert bed.wait_settled() == "edge1"
-        text = f"import os; os.environ['ZSCHED_RUNTIME_DIR'] = {str(tmp_path)!r}\n"
-        said = run_text(text + examples("docs/guide/streams.md", "python")[1])
-        assert said == [f"robot1/answer {text.upper()}" for text in QUESTIONS]
 
 
 @pytest.mark.long

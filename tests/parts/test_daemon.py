@@ -85,18 +85,6 @@ def test_node_listens_where_the_file_says_and_its_workers_dial_it_on_this_machin
     )
 
 
-def test_workers_dial_the_applications_that_have_their_streams_themselves() -> None:
-    """Their own robot's, too; an edge has none."""
-    robots = [
-        replace(spec(name, host=f"192.0.2.{n}", data="tcp/0.0.0.0:7458"), kind=NodeKind.ROBOT, listen_streams=streams)
-        for n, (name, streams) in enumerate((("r1", "tcp/0.0.0.0:7459"), ("r2", "tcp/192.0.2.9:7459"), ("r3", "")), 1)
-    ]
-    edge = spec("e", host="192.0.2.11", data="tcp/0.0.0.0:7458")
-    assert endpoints(edge, *robots).worker_connect[4:] == ("tcp/192.0.2.1:7459", "tcp/192.0.2.9:7459")
-    assert endpoints(robots[0], edge, *robots[1:]).worker_connect[3:] == ("tcp/127.0.0.1:7459", "tcp/192.0.2.9:7459")
-    assert len(endpoints(robots[2], edge).worker_connect) == 1
-
-
 def test_node_without_endpoints_takes_free_ports_and_knows_the_one_that_its_workers_need() -> None:
     found = endpoints(spec("a"))
     assert found.control_listen == ("tcp/0.0.0.0:0",)

@@ -348,7 +348,6 @@ PROGRAMS: Final[dict[str, str]] = {
     "daemon": "import zsched.daemon",
     "relay": "import zsched.relay.__main__, zsched.relay.process",
     "worker": "import zsched.worker",
-    "stream": "import zsched.stream",
     "cli": "import zsched.cli",
     "cli check": "sys.argv[1:] = ['check', 'configs/fleet.yaml']; import zsched.cli; run(zsched.cli.main)",
     "cli help": "sys.argv[1:] = ['--help']; import zsched.cli; run(zsched.cli.main)",

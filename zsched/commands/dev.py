@@ -150,10 +150,9 @@ def _addresses(fleet: Fleet, stack: ExitStack) -> dict[NodeId, Addresses]:
         return f"tcp/127.0.0.1:{claim.port}"
 
     def here(node: NodeSpec) -> Addresses:
-        streams = free() if node.listen_streams else ""
         if node.local is None:
-            return Addresses(control=free(), data=joins(node.name), streams=streams)
-        return Addresses(control=free(), data=free(), local=joins(node.name), streams=streams)
+            return Addresses(control=free(), data=joins(node.name))
+        return Addresses(control=free(), data=free(), local=joins(node.name))
 
     return {node.name: here(node) for node in fleet.nodes}
 
@@ -188,8 +187,6 @@ def _introduce(
     enter.write_text(entrance(nodes, robot), encoding="utf-8")
     _say("zsched asks this fleet in a terminal that begins with:")
     _say_to_copy(f"source {shlex.quote(str(enter))}")
-    for name in (node.name for node in fleet.nodes if node.listen_streams and node.kind is NodeKind.ROBOT):
-        _say(f'there an application has its streams itself by `Streams.join(node="{name}")` of zsched.stream')
     _say(f"in others: `zsched status --runtime-dir {nodes.folder} --node {robot}`")
 
 

@@ -423,8 +423,8 @@ def _in_turns(verdicts: tuple[_Verdict, ...]) -> Iterator[_Verdict]:
 
 
 def _addresses(fleet: Fleet) -> dict[NodeId, set[str]]:
-    """{robot: where workers dial its data session, and an application of its that has its streams itself}."""
-    return {node.name: {node.data_at, node.streams_at} - {""} for node in fleet.nodes if node.kind is NodeKind.ROBOT}
+    """{robot: where workers dial its data session}."""
+    return {node.name: {node.data_at} - {""} for node in fleet.nodes if node.kind is NodeKind.ROBOT}
 
 
 def _nodes(old: Fleet, new: Fleet) -> Iterator[_Verdict]:
@@ -448,7 +448,7 @@ def _node(old: NodeSpec, new: NodeSpec) -> Iterator[_Verdict]:
     if old.host != new.host:
         text = f"the others dial {old.name} there once it is gone from where it was"
         yield _restart(text, f"{path}.host", old.host, new.host)
-    for name in ("control", "data", "streams"):
+    for name in ("control", "data"):
         before, after = getattr(old, f"listen_{name}"), getattr(new, f"listen_{name}")
         if before != after:
             yield _restart(restart, f"{path}.listen.{name}", before, after, again)

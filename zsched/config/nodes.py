@@ -100,21 +100,10 @@ def _node(name: str, given: Section, names: tuple[str, ...], folder: Path, out: 
         host=given.get("host", ""),
         listen_control=listen.get("control", "") if listen is not None else "",
         listen_data=listen.get("data", "") if listen is not None else "",
-        listen_streams=_streams(given, listen, out) if listen is not None else "",
         labels=tuple(sorted((key, held.value) for key, held in labels.items() if held.value is not None)),
         links=links,
         local=_local(given, out),
     )
-
-
-def _streams(given: Section, listen: Section, out: Collector) -> str:
-    endpoint: str = listen.get("streams", "")
-    if endpoint and not Endpoint.of(endpoint).dialled(given.get("host", "")):
-        message = "no worker can dial an application there"
-        out.error(listen.where("streams"), message, "give it a fixed port, and the node a `host:`")
-    if endpoint and given.get("kind") is NodeKind.EDGE:
-        out.warn(listen.where("streams"), "an edge has no streams of its own: no application listens there")
-    return endpoint
 
 
 def _local(given: Section, out: Collector) -> LocalSide | None:
@@ -155,7 +144,7 @@ def _check_endpoints(entries: dict[str, Located[Section | None]], out: Collector
         listen: Section | None = section.get("listen") if section is not None else None
         if section is None or listen is None:
             continue
-        for kind in ("control", "data", "streams"):
+        for kind in ("control", "data"):
             # a node without a host listens "everywhere", but on its own machine
             endpoint = listen.get(kind, "")
             dialled = Endpoint.of(endpoint).dialled(section.get("host", "") or name)

@@ -165,11 +165,8 @@ NODE: Final = Record(
                         "Endpoint of the data session, another port.",
                         default="port 7458 if it is free, else any free port",
                     ),
-                    "streams": Field(
-                        _ENDPOINT,
-                        "Where workers dial an application with `zsched.stream`; a fixed port.",
-                    ),
                 },
+                removed={"streams": "delete it: an application joins its robot's relay as a client of zenoh"},
             ),
             "Where this node listens.",
         ),

@@ -117,7 +117,7 @@ def _check_endpoints(section: Section, given: Section, out: Collector) -> None:
     nodes: dict[str, Located[Section | None]] = section.get("nodes", {})
     for entry in nodes.values():
         listen: Section | None = entry.value.get("listen") if entry.value is not None else None
-        for kind in ("control", "data", "streams") if listen is not None else ():
+        for kind in ("control", "data") if listen is not None else ():
             assert listen is not None
             listener = Endpoint.of(listen.get(kind, ""))
             if listener.protocol not in ("", TLS):

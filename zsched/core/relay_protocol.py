@@ -223,8 +223,6 @@ class StreamAcks(Struct, frozen=True, kw_only=True):
     """A receiver's acknowledgements for one session, those that changed."""
 
     acks: tuple[StreamAck, ...]
-    is_application: bool = False
-    """An application's that has its streams itself: it stands beside its robot's relay, in whose place it is not."""
 
 
 class SlotLost(Struct, frozen=True, kw_only=True):

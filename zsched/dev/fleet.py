@@ -37,8 +37,6 @@ class Addresses(Struct, frozen=True, kw_only=True):
     data: str
     local: str = ""
     """Of a node whose applications have a network of their own: where they join it."""
-    streams: str = ""
-    """Of a node whose application may have its streams itself: where workers dial it."""
 
     @property
     def joins(self) -> str:
@@ -115,8 +113,6 @@ def _node_here(given: reader.Node | None, addresses: Addresses) -> reader.Mappin
     kept = tuple((key, value) for key, value in given.pairs if key.text in KEPT)
     host = Endpoint.of(addresses.data).host
     listen = {"control": addresses.control, "data": addresses.data}
-    if addresses.streams:
-        listen["streams"] = addresses.streams
     new: dict[str, Any] = {"host": host, "listen": listen}
     if addresses.local:
         new["local"] = {"mode": "peer", "listen": [addresses.local]}

@@ -32,10 +32,6 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("relay_hello", protocol.RelayHello, wire.LARGE),
     ("relay_here", protocol.RelayHere, _SMALL),
     ("relay_refused", protocol.RelayRefused, _SMALL),
-    ("stream_keys", protocol.StreamKeys, wire.LARGE),
-    ("streams_here", protocol.StreamsHere, _SMALL),
-    ("streams_taken", protocol.StreamsTaken, wire.LARGE),
-    ("daemon_gone", protocol.DaemonGone, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("worker_watch", relay_protocol.WorkerWatch, wire.LARGE),
     ("worker_matched", relay_protocol.WorkerMatched, _SMALL),
@@ -76,21 +72,6 @@ REPORTS: Final[tuple[type[Any], ...]] = (
     events.SlotFlipped,
     events.SlotDrained,
     events.RoleEnded,
-    events.StreamsCounted,
-    events.ProblemReported,
-)
-
-TO_APPLICATIONS: Final[tuple[type[Any], ...]] = (
-    RoutePlan,
-    relay_protocol.WorkerWatch,
-    relay_protocol.TaskEnded,
-    protocol.StreamsTaken,
-    protocol.DaemonGone,
-)
-OF_APPLICATIONS: Final[tuple[type[Any], ...]] = (
-    protocol.StreamKeys,
-    events.SlotDrained,
-    relay_protocol.SlotLost,
     events.StreamsCounted,
     events.ProblemReported,
 )

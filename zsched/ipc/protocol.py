@@ -1,19 +1,13 @@
-"""The frozen values by which a relay knows its daemon, and an application that has its streams itself knows its relay.
+"""The frozen values by which a relay knows its daemon.
 
-Knows: the greeting between a relay and the successor of its daemon, the pulse; an application's keys and what it is
-told of them. Does not know: pipes, frames, plans.
+Knows: the greeting between a relay and the successor of its daemon, the pulse. Does not know: pipes, frames, plans.
 """
 
 from __future__ import annotations
 
-from typing import Final
-
 from zsched.core.values.model import NodeId, TaskId, check_counter, check_name
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
-
-MAX_KEYS: Final = 256
-"""Of one application."""
 
 
 class RelayPulse(Struct, frozen=True, kw_only=True):
@@ -60,39 +54,3 @@ class RelayRefused(Struct, frozen=True, kw_only=True):
     """The relay is not this daemon's."""
 
     reason: str
-
-
-# --- an application and its node's relay (`zsched.stream`) -----------------------------------------------------------
-
-
-class StreamKeys(Struct, frozen=True, kw_only=True):
-    """The application's first word, and again when it changes: the keys whose streams it has itself."""
-
-    keys: tuple[str, ...]
-    pid: int = 0
-
-    def __post_init__(self) -> None:
-        check_counter("keys.pid", self.pid)
-        if len(self.keys) > MAX_KEYS:
-            raise ValueError(f"{len(self.keys)} keys, at most {MAX_KEYS}")
-
-
-class StreamsHere(Struct, frozen=True, kw_only=True):
-    """The relay lets the application in; the text of the session that it opens is the next frame."""
-
-    fleet: str
-    node: NodeId
-
-    def __post_init__(self) -> None:
-        check_name("here.fleet", self.fleet)
-        check_name("here.node", self.node)
-
-
-class StreamsTaken(Struct, frozen=True, kw_only=True):
-    """The application's keys that are a stream's of some task; plans of these have been said before."""
-
-    keys: tuple[str, ...]
-
-
-class DaemonGone(Struct, frozen=True, kw_only=True):
-    """Nobody tells the relay, and so the application, of another owner until the next plan."""

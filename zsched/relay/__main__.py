@@ -4,7 +4,6 @@ Knows: the command line, signals, the parent's death. Does not know: streams.
 
 ``python -m zsched.relay --fleet F --node N [--threads T] [--parent PID] [--local]``; the first frame on stdin is
 the zenoh session as JSON (with ``--local`` the second one is that of the host's own side). Logs go to stderr.
-With ``--streams PATH --streams-listen ENDPOINT`` an application of this node may have its streams itself.
 With ``--books PATH`` its counters go on from those of the relay before.
 With ``--door FD --orphan S`` it outlives its daemon for S seconds and obeys the next one that comes through the door;
 without, it dies with its parent.
@@ -63,8 +62,6 @@ def main() -> int:
         door=arguments.door,
         orphan_s=arguments.orphan,
         parent=arguments.parent,
-        streams=Path(arguments.streams) if arguments.streams else None,
-        streams_listen=arguments.streams_listen,
         books=Path(arguments.books) if arguments.books else None,
     )
 
@@ -82,8 +79,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--incarnation", type=int, default=0, help="of the daemon that starts us")
     parser.add_argument("--digest", default="", help="what the next daemon must have been started with")
     parser.add_argument("--session", default="", help="a digest over what the data session is opened with")
-    parser.add_argument("--streams", default="", help="the socket for an application that has its streams itself")
-    parser.add_argument("--streams-listen", default="", help="the endpoint at which workers dial that application")
     parser.add_argument("--books", default="", help="the file in which a relay finds what those before have counted")
     parser.add_argument("--log-level", default="WARNING")
     return parser.parse_args()

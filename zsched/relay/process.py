@@ -30,13 +30,12 @@ from zsched.core.membership.relink import Introductions
 from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
-from zsched.core.values.plan import Role, Route, RoutePlan, StreamCount
+from zsched.core.values.plan import Role, Route, RoutePlan
 from zsched.errors import WireError
 from zsched.guard import calmed, ends_within, guarded, on_failure
 from zsched.heap import Leftovers
 from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
 from zsched.ipc.protocol import RelayHello, RelayPulse
-from zsched.relay.application import Application
 from zsched.relay.books import Books
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
@@ -167,7 +166,6 @@ class RelayProcess:
         introducer: Introducer | None = None,
         link_lease_s: float = DEFAULT_LEASE_S,
         members: frozenset[str] | None = None,
-        application: Application | None = None,
         books: Books | None = None,
     ) -> None:
         """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any.
@@ -175,8 +173,6 @@ class RelayProcess:
         ``books``: with what relays before this one have counted.
         """
         self._books = books or Books(None)
-        self._application = application or Application(fleet, node, None, "", reporter.report)
-        self._application.counts = self._own_counts
         self._session, self._fleet = session, fleet
         self._counting, self._refused = threading.Lock(), Counter[Refusal]()
         self._expulsion = self._expel_from(session, members)
@@ -251,7 +247,6 @@ class RelayProcess:
                 task.rejoin(session, self._own_ids)
             self._token = self._shown(session)
             self._mute_links = MuteLinks(session, Keyspace(self._fleet))
-            self._application.open(config)
         _log.warning(
             "the data session is opened anew: streams waited %.2f s for what was under way, it took %.2f s",
             left_at - began,
@@ -333,7 +328,6 @@ class RelayProcess:
     def go_on_alone(self) -> None:
         """The daemon is gone, and nobody says what holds: see the module's first lines."""
         self._roles.forget()
-        self._application.lose_daemon()
         for task in tuple(self._tasks.values()):
             task.lose_daemon()
 
@@ -372,7 +366,6 @@ class RelayProcess:
     def _end(self, name: TaskId) -> None:
         self._roles.end(name)
         self._matching.forget(name)
-        self._application.end(name)
         with self._lock:
             for table in (self._waiting, self._standbys, self._unowned):
                 table.pop(name, None)
@@ -385,11 +378,9 @@ class RelayProcess:
 
     def _listen(self, task: TaskId, routes: tuple[Route, ...], graph: GraphMirror) -> None:
         if routes or task in self._tasks:
-            self._application.unowned(task, routes)
             self._task(task, graph).listen(routes)
 
     def _apply(self, plan: RoutePlan, graph: GraphMirror) -> None:
-        self._application.plan(plan)
         self._task(plan.task, graph).apply(plan)
 
     def _task(self, name: TaskId, graph: GraphMirror) -> TaskRelay:
@@ -400,7 +391,7 @@ class RelayProcess:
                 name,
                 self._tokens,
                 self._acks,
-                self._application.report,
+                self._reporter.report,
                 graph,
                 OpenStreams(self._session, self._own_ids, self._local),
                 self._local,
@@ -442,14 +433,10 @@ class RelayProcess:
                 self._introducer.introduce()
             self._mute_links.look(missed - {self._node}, awake_s())
 
-    def _own_counts(self) -> tuple[StreamCount, ...]:
-        return tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
-
     def _tell_counts(self, *, is_last: bool = False) -> None:
-        own = self._application.apart(self._own_counts())
-        counts = self._books.added(own)
-        self._books.write(self._application.settled(own), is_last=is_last)
-        self._reporter.report(StreamsCounted(counts=self._application.added(counts)))
+        own = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
+        self._books.write(own, is_last=is_last)
+        self._reporter.report(StreamsCounted(counts=self._books.added(own)))
 
 
 def _of_thread(kind: str) -> str:
@@ -495,14 +482,11 @@ def run(
     door: int | None = None,
     orphan_s: float = 0.0,
     parent: int = 0,
-    streams: Path | None = None,
-    streams_listen: str = "",
     books: Path | None = None,
 ) -> int:
     """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened.
 
     ``books`` is where the counters of this node's relays stand.
-    ``streams`` is the socket for an application that has its streams itself, which listens at ``streams_listen``.
     ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
     ``parent`` is that daemon's process; 0: our parent's. It may be gone before we can ask who our parent is.
     """
@@ -520,7 +504,6 @@ def run(
         reporter.report(ProblemReported(source=SOURCE, problem=problem))
         reporter.flush(CLOSE_S)
         return 1
-    application = Application(me.fleet, me.node, streams, streams_listen, reporter.report)
     relay = RelayProcess(
         session,
         me.fleet,
@@ -530,10 +513,8 @@ def run(
         Introducer(config),
         lease_s(config),
         members_of(config),
-        application,
         Books(books),  # the relay before has gone: it had our port
     )
-    application.open(config)
     successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
     wakeups, parent = _signals_wake(), parent or os.getppid()
     try:

@@ -57,8 +57,7 @@ def endpoints_for(
     A link is dialled by one side only: of two that redial each other one may take the other's new link for a part of
     its old session, and tells it nothing again (eclipse-zenoh/zenoh#2806). A node without an address dials every node
     that has one; two without one meet by gossip, and zenoh's ids decide which one dials. Workers dial their own
-    relay first, then the robots', and listen nowhere, so nobody dials them: an application that has its streams itself
-    (`zsched.stream`) listens, and they dial it.
+    relay first, then the robots', and listen nowhere, so nobody dials them.
     Our own address on another machine (``is_here``) is dialled too: there a twin of ours may be, and must be heard.
     """
     robots = [node for node in fleet.nodes if node.kind is NodeKind.ROBOT and node.name != me.name]
@@ -74,8 +73,6 @@ def endpoints_for(
         worker_connect=(
             dialled_here(data_listen),
             *_dialled(robots, _data),
-            *([dialled_here(me.listen_streams)] if me.kind is NodeKind.ROBOT and me.listen_streams else []),
-            *_dialled(robots, _streams),
         ),
         control_by_gossip=not _dialled([me], _control) and len(_hidden(list(fleet.nodes), _control)) > 1,
         data_by_gossip=not _dialled([me], _data),
@@ -85,7 +82,6 @@ def endpoints_for(
 
 _control: Callable[[NodeSpec], str] = attrgetter("control_at")
 _data: Callable[[NodeSpec], str] = attrgetter("data_at")
-_streams: Callable[[NodeSpec], str] = attrgetter("streams_at")
 
 
 def _targets(

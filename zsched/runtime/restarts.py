@@ -23,7 +23,6 @@ _FIELDS = (
 _OWN = (
     ("listen_control", "`listen: {control}`"),
     ("listen_data", "`listen: {data}`"),
-    ("listen_streams", "`listen: {streams}`"),
     ("local", "`local`"),
 )
 

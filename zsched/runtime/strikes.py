@@ -140,7 +140,7 @@ def why_no_cut(fleet: Fleet, me: NodeId) -> str:
 
 def ports_of(fleet: Fleet) -> tuple[int, ...]:
     """The ports at which the fleet's sessions listen."""
-    ends = [end for node in fleet.nodes for end in (node.listen_control, node.listen_data, node.listen_streams)]
+    ends = [end for node in fleet.nodes for end in (node.listen_control, node.listen_data)]
     return tuple(sorted({int(found[1]) for end in ends if (found := _PORT.search(end)) is not None}))
 
 

@@ -101,7 +101,7 @@ def _open_sides(me: NodeSpec) -> tuple[str, ...]:
 
 def plain_text_problem(me: NodeSpec, protocol: str) -> str | None:
     """Where this node listens in plain text although the fleet has TLS, because the fleet file says so."""
-    given = (me.listen_control, me.listen_data, me.listen_streams)
+    given = (me.listen_control, me.listen_data)
     plain = [end for end in given if end and _scheme(end) not in ENCRYPTED]
     if protocol == PLAIN or not (plain or _open_sides(me)):
         return None

@@ -11,5 +11,3 @@ CLOSE_S: Final = 0.6
 """Of the daemon's own processes (relay, worker, driver), which leave by ``os._exit``: then the process ends."""
 ALARM_S: Final = 0.9
 """...and should zenoh hold Python's global lock meanwhile, the kernel ends a process that was told to stop."""
-APPLICATION_CLOSE_S: Final = 3.0
-"""Of an application: its interpreter ends in its own way, and that aborts beside a session that still closes."""

@@ -205,21 +205,6 @@ def client_config(
     return _render(settings, operator_json5)
 
 
-def application_config(session: str, listen: str) -> str:
-    """Of a relay's data session (its configuration): that of an application which has its streams itself.
-
-    It listens at ``listen``, where workers dial it, and dials nobody; nobody hears of it by gossip.
-    """
-    return on_top_of(
-        session,
-        {
-            "listen/endpoints": list(_small_buffers((listen,))),
-            "connect/endpoints": [],
-            "scouting/gossip/enabled": False,
-        },
-    )
-
-
 def introduction_config(session: str) -> str | None:
     """Of a session (its configuration) that meets others by gossip: one that dials the same nodes and their peers.
 

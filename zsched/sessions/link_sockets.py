@@ -15,13 +15,11 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
-import json
-import os
 import re
 import select
 import socket
 import struct
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -61,7 +59,6 @@ _TCP_THIN_LINEAR_TIMEOUTS: Final = 16
 _WITH_THRESHOLD: Final = b"reno"
 """A congestion control by which those waits become equal, as with CUBIC, not with BBR; every user may choose it."""
 _ADDRESS: Final = re.compile(r"(?:tcp|tls)/\[?([^\]#?]+)\]?:(\d+)")
-_PORT: Final = re.compile(r"(?:tcp|tls)/[^?#]*:(\d+)")
 _NEVER: Final = 1 << 30
 _NOBODY: Final = struct.pack("=H14x", socket.AF_UNSPEC)
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
@@ -198,18 +195,14 @@ class LinkSockets:
                         self._known[ends] = int(path.name)
 
 
-def opened(config: str, *, is_guest: bool = False) -> Session:
+def opened(config: str) -> Session:
     """A session of this configuration (JSON5); whoever dials it and says nothing waits in the kernel.
-
-    ``is_guest``: the process is an application's, whose own servers are not touched.
 
     Raises:
         zenoh.ZError, ValueError: it cannot be opened.
     """
-    settings = zenoh.Config.from_json5(config)
-    others, ports = (_listening(), _listens_at(settings)) if is_guest else (frozenset(), None)
-    session = zenoh.open(settings)
-    hold_back_silent(ports, others)
+    session = zenoh.open(zenoh.Config.from_json5(config))
+    hold_back_silent()
     return session
 
 
@@ -231,11 +224,8 @@ def retry_steadily(wanted: Iterable[Ends]) -> int:
     return count
 
 
-def hold_back_silent(ports: Collection[int] | None = None, others: Collection[int] = ()) -> int:
+def hold_back_silent() -> int:
     """Let the kernel keep connections that say nothing from this process's sessions; how many listeners do so.
-
-    ``ports``: only listeners there, ``None``: all; ``others``: not these (`_listening`). A server that speaks first
-    would get nobody for an hour.
 
     Who dials a session of zenoh speaks first, with TLS or without. A connection that does not costs zenoh 7 KiB and a
     descriptor, and 0.1 s of its listener's time at the end of each handshake: thousands keep new members out for
@@ -244,10 +234,9 @@ def hold_back_silent(ports: Collection[int] | None = None, others: Collection[in
     count = 0
     for held in _listeners():
         with contextlib.suppress(OSError):
-            if (ports is None or held.getsockname()[1] in ports) and _identity(held) not in others:
-                held.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENT_S)
-                held.listen(WAITING)
-                count += 1
+            held.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENT_S)
+            held.listen(WAITING)
+            count += 1
     return count
 
 
@@ -257,22 +246,6 @@ def _listeners() -> Iterator[socket.socket]:
         with contextlib.suppress(OSError), _borrowed(int(path.name)) as held:
             if held.family in _INTERNET and held.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
                 yield held
-
-
-def _listening() -> frozenset[int]:
-    """Which sockets listen now."""
-    return frozenset(_identity(held) for held in _listeners())
-
-
-def _identity(held: socket.socket) -> int:
-    """The socket's own number, which stays when its descriptor is given to another one."""
-    return os.fstat(held.fileno()).st_ino
-
-
-def _listens_at(settings: zenoh.Config) -> frozenset[int]:
-    """The ports at which a session of this configuration listens."""
-    told = json.loads(settings.get_json("listen/endpoints"))
-    return frozenset(int(port[1]) for one in told if (port := _PORT.match(str(one))) is not None)
 
 
 def with_room(links: Iterable[LinkSocket], wait_s: float) -> set[int]:

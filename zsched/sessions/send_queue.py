@@ -89,8 +89,7 @@ class SendQueue:
         self._busy_since: float | None = None
         self._in_hand: Any = None
         self._is_taken = False
-        """An action is being done, or about to be: by our thread, or by the one that has claimed it."""
-        self._claimed: Action | None = None
+        """An action is being done, or about to be."""
         self._thread = guarded(self._run, name=name, kind="queue")
         self._thread.start()
 
@@ -144,38 +143,6 @@ class SendQueue:
         if is_awaited:
             self._bell.put(None)
         return dropped
-
-    def claim(self, action: Action, value: Any = None) -> bool:
-        """Leave the next action to the caller, who calls `do_claimed` at once, under no lock of his.
-
-        ``False``: something waits, or is being done; then it has to queue (`send`).
-        """
-        with self._lock:
-            if self._is_closed or self._items or self._is_taken or self._is_kicked:
-                return False
-            self._is_taken, self._claimed = True, action
-            self._in_hand, self._left_at = value, monotonic_s()
-            return True
-
-    def do_claimed(self) -> None:
-        """Do what was claimed; what has come meanwhile follows in our own thread."""
-        action, self._claimed = self._claimed, None
-        if action is None:
-            return
-        try:
-            self._do(action)
-        finally:  # also of a thread that Ctrl-C takes out of its put
-            self._release()
-
-    def _release(self) -> None:
-        """What was claimed is done."""
-        with self._lock:
-            self._in_hand, self._is_taken = None, False
-            is_awaited = (self._items or self._is_kicked or self._is_closed) and (self._wants_item or self._wants_kick)
-            if is_awaited:
-                self._wants_item = self._wants_kick = False
-        if is_awaited:
-            self._bell.put(None)
 
     def has_room(self, size: int) -> bool:
         """True when a sample of ``size`` bytes would be taken now."""
@@ -269,10 +236,7 @@ class SendQueue:
 
     def _next(self) -> Action | None:
         """The next action, waiting for one; ``None`` once closed."""
-        while not self._is_closed or self._is_taken:
-            if self._is_taken:  # somebody does what he has claimed
-                self._sleep(is_shut=False)
-                continue
+        while not self._is_closed:
             if self._is_kicked:
                 self._kicked()
             is_shut = bool(self._items) and not self._is_open()
@@ -286,8 +250,6 @@ class SendQueue:
 
     def _kicked(self) -> None:
         with self._lock:
-            if self._is_taken:
-                return
             self._is_kicked = False
             self._is_taken = True
         if self._at_kick is not None:
@@ -297,8 +259,7 @@ class SendQueue:
     def _sleep(self, *, is_shut: bool) -> None:
         """Until something comes (`POLL_S` at most while shut), a kick or the end."""
         with self._lock:
-            is_due = self._is_closed or self._is_kicked or (self._items and not is_shut)
-            if is_due and not self._is_taken:
+            if self._is_closed or self._is_kicked or (self._items and not is_shut):
                 return
             self._wants_item, self._wants_kick = not is_shut, True
         with contextlib.suppress(queue.Empty):
@@ -314,7 +275,7 @@ class SendQueue:
 
     def _take(self) -> Action | None:
         with self._lock:
-            if self._is_closed or self._is_taken or not self._items:  # claimed, or taken back
+            if self._is_closed or not self._items:  # taken back
                 return None
             waiting = self._items.popleft()
             self._is_taken = waiting.action is not None

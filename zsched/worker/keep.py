@@ -54,8 +54,6 @@ MAX_FRAME_BYTES: Final = 1 << 17
 """Of one frame of acknowledgements: ours have at most `zsched.hop.acknowledger.MAX_PER_FRAME`, and take less."""
 MAX_FRAMES: Final = 256
 """Frames that wait for the thread."""
-BESIDE: Final = " (application)"
-"""Behind a robot's name (no name has such characters): its application that has its streams itself."""
 
 _log = logging.getLogger("zsched.worker")
 
@@ -330,11 +328,10 @@ class Keeper:
         if key is None or len(key.rest) != 2:
             _log.warning("an acknowledgement under a malformed key was ignored")
             return
-        node = f"{key.owner}{BESIDE}" if frame.is_application else key.owner
         for ack in frame.acks:
             lane = self._lanes.get(ack.eid)
             if lane is not None and ack.of in (0, mark_of(lane.key)):  # else an owner has named ours under its own key
-                self._acknowledged(lane, key.rest[0], node, ack)
+                self._acknowledged(lane, key.rest[0], key.owner, ack)
 
     def _acknowledged(self, lane: KeptLane, relay: str, node: str, ack: StreamAck) -> None:
         lane.hear(relay, node, ack, monotonic_s())

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from support.clinic import FLEET, answer, assert_finds, run, scene_of
+from support.clinic import answer, assert_finds, run, scene_of
 from zsched.core.route.ros2 import Attachment, encode_attachment
 from zsched.doctor.model import Scene, Verdict
 from zsched.sessions import config as zenoh_config
@@ -127,10 +127,3 @@ def test_an_output_that_nobody_takes_is_found(scene: Scene, site: Site, mode: st
     assert run("stream.unheard", merged).verdict is Verdict.PASS
     own = {**site.sides, "local": zenoh_config.client_config(connect=("tcp/127.0.0.1:1",))}
     assert_finds(run("stream.unheard", replace(merged, sides=own)), Verdict.FAIL, "cannot be joined")
-
-
-def test_who_has_streams_in_its_own_process_is_not_judged(tmp_path: Path, site: Site) -> None:
-    text = FLEET.replace("robot1: {", 'robot1: {listen: {streams: "tcp/127.0.0.1:7459"}, ', 1)
-    scene = replace(scene_of(tmp_path, text, node="robot1"), sides=site.sides)
-    merged = with_output(scene)
-    assert run("stream.unheard", merged).verdict is Verdict.SKIP

@@ -504,5 +504,4 @@ def test_a_relay_hears_that_a_task_has_no_input_any_more(scene: Scene) -> None:
     until(lambda: list(streams.inputs) == ["t/in/0"], "the input")
     relay._do(WorkerWatch(task="t"))
     until(lambda: not streams.inputs, "its end")
-    assert relay._application._shares.unowned == {"t": ()}, "nor has an application"
     relay._do(TaskEnded(task="t"))

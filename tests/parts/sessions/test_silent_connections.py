@@ -6,16 +6,15 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from typing import IO
 
 import psutil
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched.sessions.config import client_config, control_config, data_config
-from zsched.sessions.link_sockets import hold_back_silent, opened
+from zsched.sessions.config import client_config, control_config
+from zsched.sessions.link_sockets import hold_back_silent
 from zsched_lab.fleet.floods import connections
 
 COUNT = 200
@@ -69,37 +68,3 @@ def test_in_a_process_of_ours_a_socket_that_does_not_listen_is_left_alone() -> N
         assert hold_back_silent() >= 1
         assert server.getsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT) > 0
         assert not other.getsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT)
-
-
-def test_in_an_applications_process_only_the_sessions_own_socket_is_changed() -> None:
-    endpoint = free_endpoint()
-    host, text = endpoint.removeprefix("tcp/").split(":")
-    port = int(text)
-    with (
-        socket.create_server(("127.0.0.1", 0)) as server,
-        socket.create_server(("127.250.0.2", port)) as same_port,
-        opened(data_config(listen=(endpoint,), connect=(), shared_memory=False), is_guest=True),
-    ):
-        for own in (server, same_port):
-            assert not own.getsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT)
-        with socket.create_connection(server.getsockname()) as client:
-            server.settimeout(5.0)
-            with server.accept()[0] as taken:
-                taken.sendall(b"$GPGGA")
-                assert client.recv(6) == b"$GPGGA", "a server that speaks first has its client"
-        assert deferred(port) == {host: True, "127.250.0.2": False}, "zenoh's, and not the application's"
-
-
-def deferred(port: int) -> dict[str, bool]:
-    """{address: whether this process's listener there, at this port, defers}."""
-    found: dict[str, bool] = {}
-    for path in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):
-            held = socket.socket(fileno=int(path.name))
-            try:
-                if held.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) and held.getsockname()[1] == port:
-                    is_deferred = held.getsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT) > 0
-                    found[held.getsockname()[0]] = is_deferred
-            finally:
-                held.detach()
-    return found

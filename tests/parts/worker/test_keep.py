@@ -333,22 +333,6 @@ def test_an_acknowledgement_under_a_malformed_key_is_nobody_s(bench: Bench) -> N
     assert list(lane.state.receivers) == [robot.relay]
 
 
-def test_an_application_beside_its_relay_is_not_taken_for_the_relay_s_next_life(bench: Bench) -> None:
-    lane = bench.lane()
-    relay, application = bench.robot("robot1", "aa1"), bench.robot("robot1", "aa2")
-    keep(lane, *range(4))
-    relay.ack(bench.eid, 4)
-    until(lambda: "aa1" in lane.state.receivers, "the relay's word")
-    word = StreamAck(eid=bench.eid, first=0, arrived=2, processed=2)
-    key = KEYS.received("robot1", application.relay, str(bench.worker.zid()))
-    bench.outside.put(key, wire.encode(StreamAcks(acks=(word,), is_application=True)))
-    until(lambda: "aa2" in lane.state.receivers, "the application's word")
-    assert {name: one.arrived for name, one in lane.state.receivers.items()} == {"aa1": 4, "aa2": 2}
-    bench.robot("robot1", "aa3").ack(bench.eid, 4)
-    until(lambda: "aa3" in lane.state.receivers, "the next relay's word")
-    assert sorted(lane.state.receivers) == ["aa2", "aa3"], "in its relay's place, and not in the application's"
-
-
 class LateBell(worker_keep._Bell):
     """Something happens in the moment before it is put back."""
 

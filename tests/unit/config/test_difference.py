@@ -149,12 +149,6 @@ def test_workers_take_a_new_process_for_all_that_a_process_keeps() -> None:
     assert ("nodes.robot4", "robot4 may join: start its daemon") in [
         (one.path, one.consequence) for one in changes(*relayed)
     ], "who hangs on the relay dials nobody else"
-    own = with_("tcp/0.0.0.0:7458}}", 'tcp/0.0.0.0:7458, streams: "tcp/0.0.0.0:7459"}, labels: {arm: left}}', robot)
-    text = "the daemon of robot4 must be restarted; workers of map_merge restart one after another, to dial robot4"
-    assert [(one.path, one.consequence) for one in changes(own, robot)] == [
-        ("nodes.robot4.listen.streams", text),
-        ("nodes.robot4.labels", "takes effect at once"),
-    ]
     late = with_("price_s: 0.3}", "price_s: 0.3, objective: latency, deadline_ms: 80}")
     (told,) = (one for one in changes(late) if one.path.endswith("deadline_ms"))
     assert (told.effect, told.after) == (Effect.WORKERS, "80")

@@ -742,27 +742,10 @@ def test_a_fleet_without_robots_waits_for_one_and_all_its_nodes_are_electors() -
     assert result.fleet.electors == tuple(node.name for node in result.fleet.nodes)
 
 
-@pytest.mark.parametrize(
-    ("streams", "message"),
-    [
-        ("tcp/0.0.0.0:7457", "tcp/0.0.0.0:7457 is already r1's control session"),
-        ("tcp/0.0.0.0:7458", "tcp/0.0.0.0:7458 is already r1's data session"),
-        ("tcp/0.0.0.0:0", "no worker can dial an application there"),
-        ("tpc/0.0.0.0:7459", "it must begin with"),
-        ("tcp/0.0.0.0:7459", ""),
-    ],
-)
-def test_an_application_with_streams_of_its_own_has_a_port_that_workers_can_dial(streams: str, message: str) -> None:
-    listen = f"{{control: tcp/0.0.0.0:7457, data: tcp/0.0.0.0:7458, streams: {streams}}}"
-    result = check(f"fleet: f\nnodes:\n  r1: {{kind: robot, host: 192.0.2.1, listen: {listen}}}\n")
-    if message:
-        assert message in result.report()
-        return
-    assert result.fleet is not None
-    assert result.fleet.nodes[0].listen_streams == streams
-    on_an_edge = f"{{kind: edge, host: 192.0.2.2, listen: {listen}}}"
-    told = check(f"fleet: f\nnodes:\n  r1: {{kind: robot}}\n  e1: {on_an_edge}\n").report()
-    assert "an edge has no streams of its own" in told
+def test_a_listen_section_that_names_streams_says_how_an_application_joins() -> None:
+    listen = "{data: tcp/0.0.0.0:7458, streams: tcp/0.0.0.0:7459}"
+    told = check(f"fleet: f\nnodes:\n  r1: {{kind: robot, host: 192.0.2.1, listen: {listen}}}\n").report()
+    assert "an application joins its robot's relay as a client of zenoh" in told
 
 
 def test_nodes_that_nobody_can_dial_are_refused() -> None:

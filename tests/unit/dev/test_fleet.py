@@ -21,7 +21,6 @@ def addresses(fleet: Fleet) -> dict[str, Addresses]:
             control=f"tcp/127.0.0.1:{20000 + number}",
             data=f"tcp/127.0.0.1:{30000 + number}",
             local="" if node.local is None else f"tcp/127.0.0.1:{40000 + number}",
-            streams=f"tcp/127.0.0.1:{50000 + number}" if node.listen_streams else "",
         )
         for number, node in enumerate(fleet.nodes)
     }
@@ -103,15 +102,6 @@ def test_a_secured_fleet_runs_here_without_certificates(tmp_path: Path) -> None:
     assert "no certificates (`security:`): whoever is on this machine is let in" in found.left_out
     assert fleet.security is None
     assert load_fleet(file).security is not None
-
-
-def test_an_application_may_have_its_streams_itself_here_too(tmp_path: Path) -> None:
-    listen = "host: 192.0.2.21, listen: {data: tcp/0.0.0.0:7458, streams: tcp/0.0.0.0:7459}"
-    file = written(tmp_path, FILE.replace("fixed: -57", f"fixed: -57, {listen}"))
-    _, fleet = brought_here(file)
-    told = addresses(load_fleet(file))["robot1"].streams
-    assert (fleet.node("robot1").listen_streams, fleet.node("edge1").listen_streams) == (told, "")
-    assert told
 
 
 def test_a_worker_may_be_another_one_also_where_the_file_gives_none(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ import select
 import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
 from zsched import __version__
@@ -127,26 +126,21 @@ class RelayHandle:
         local_config: str = "",
         silence_s: float = SILENCE_S,
         bequest: Bequest | None = None,
-        streams: tuple[Path, str] | None = None,
     ) -> None:
         """``zenoh_config`` is the JSON of the data session, ``threads`` the size of zenoh's pools (targets + 2).
 
         ``local_config`` is the session of the host's own side; empty: the data session serves the host, too.
-        ``streams``: the socket for an application that has its streams itself, and where it listens. Without
-        ``bequest`` the relay dies with this process. ``silence_s`` should be over zenoh's lease: a call of zenoh that
-        waits for a frozen peer may hold Python's lock that long.
+        Without ``bequest`` the relay dies with this process. ``silence_s`` should be over zenoh's lease: a call of
+        zenoh that waits for a frozen peer may hold Python's lock that long.
         """
         self._configs = tuple(text.encode() for text in (zenoh_config, local_config) if text)
         self._on_report = on_report
         self._silence_s = min(silence_s, STARVED_S)
         self._bequest = bequest
-        self._streams = streams
         self._command = [python, "-P", "-m", "zsched.relay", "--fleet", fleet, "--node", node]
         spare = 0 if bequest is None else bequest.spare_threads
         self._command += ["--threads", str(threads + spare), "--parent", str(os.getpid())]
         self._command += ["--local"] if local_config else []
-        if streams is not None:
-            self._command += ["--streams", str(streams[0]), "--streams-listen", streams[1]]
         if bequest is not None:
             digest = digest_of(bequest.digest, python, local_config)
             session = digest_of(zenoh_config, bequest.certificate)
@@ -213,8 +207,6 @@ class RelayHandle:
             self._thread.join(max(0.5, until - awake_s()))
         if self._bequest is not None and self._bequest.door.note() is None:
             self._bequest.door.remove()
-            if self._streams is not None:
-                self._streams[0].unlink(missing_ok=True)
 
     def leave(self) -> None:
         """Let go of the relay, which carries on for this node's next daemon; without a `Bequest` it is stopped."""

@@ -119,8 +119,6 @@ class NodeSpec(Struct, frozen=True, kw_only=True):
     listen_control: str = ""
     """zenoh endpoint of the control session, e.g. ``tcp/0.0.0.0:7457``."""
     listen_data: str = ""
-    listen_streams: str = ""
-    """Where an application of this robot that has its streams itself (`zsched.stream`) is dialled by workers."""
     labels: tuple[tuple[str, str], ...] = ()
     links: tuple[LinkSpec, ...] = ()
     local: LocalSide | None = None
@@ -135,11 +133,6 @@ class NodeSpec(Struct, frozen=True, kw_only=True):
     def data_at(self) -> str:
         """Where others dial its data session."""
         return Endpoint.of(self.listen_data).dialled(self.host)
-
-    @property
-    def streams_at(self) -> str:
-        """Where workers dial an application of its that has its streams itself."""
-        return Endpoint.of(self.listen_streams).dialled(self.host)
 
     @property
     def can_be_dialled(self) -> bool:
@@ -545,7 +538,7 @@ _LATER = frozenset(
         ("Demand", "gpu"),
     }
     | {("TaskSpec", name) for name in ("gauge_limits", "rollout", "cpu_floor_ratio", "prefer", "beside", "priority")}
-    | {("Fleet", "cells"), ("NodeSpec", "listen_streams"), ("WorkerSpec", "user")}
+    | {("Fleet", "cells"), ("WorkerSpec", "user")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )
 """Fields that came later: left out where they say nothing, so that nodes of two versions see the same file."""

@@ -20,7 +20,7 @@ from zsched.clock import monotonic_s
 from zsched.core.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, TaskId
-from zsched.core.values.struct import Struct, replace
+from zsched.core.values.struct import Struct
 from zsched.errors import WireError
 from zsched.guard import tolerant
 from zsched.hop.acknowledger import Acknowledger
@@ -49,14 +49,8 @@ class Acks:
         node: NodeId,
         has_token: Callable[[NodeId, TaskId, str], bool],
         lease_s: float = DEFAULT_LEASE_S,
-        *,
-        is_application: bool = False,
     ) -> None:
-        """Subscribe and start. ``has_token`` (node, task, incarnation) says whether such a worker is there.
-
-        ``is_application``: we are no relay, but stand beside our node's.
-        """
-        self._is_application = is_application
+        """Subscribe and start. ``has_token`` (node, task, incarnation) says whether such a worker is there."""
         self._has_token = has_token
         self._keyspace, self._node, self._lease_s = keyspace, node, lease_s
         self._born_at = monotonic_s()
@@ -113,7 +107,7 @@ class Acks:
         """Tell a worker how far its answers are; what is dropped here is mended by the next one."""
         self._session.put(
             self._keyspace.received(self._node, self._own_id, worker),
-            wire.encode(replace(frame, is_application=True) if self._is_application else frame),
+            wire.encode(frame),
             priority=Priority.INTERACTIVE_HIGH,
             congestion_control=CongestionControl.DROP,
         )

@@ -93,13 +93,11 @@ class InputStream:
         local: Session | None = None,
         times: AnswerTimes | None = None,
         *,
-        is_ours: bool = False,
         kept: KeptValues = (),
     ) -> None:
         """Subscribe on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
 
-        ``is_ours``: nothing is subscribed to, samples come by `give`. ``kept``: values of these keys that came
-        before, in order.
+        ``kept``: values of these keys that came before, in order.
         """
         self.route = route
         self._times = times
@@ -144,12 +142,9 @@ class InputStream:
         """Some worker has acknowledged what it has processed, or will."""
         self._stamps: Stamps | None = None
         self._loop_ids = own_ids - {str(side.zid())}
-        self._giving = threading.Lock()
-        self._in_hand: Outlet | None = None
-        """Where the sample that is given goes, if its put is left to the giver (`_giving` and our lock guard it)."""
-        self._has_end = self._is_late = False
-        """The end marker is on its way, or we are closed; what is given comes behind that (guarded likewise)."""
-        self._receiver = None if is_ours else self._subscribe(side)
+        self._has_end = False
+        """We are closed."""
+        self._receiver = self._subscribe(side)
         self._ending: Receiver | None = None
         """It has unsubscribed, and may still have samples in hand: a full queue holds them up."""
 
@@ -163,21 +158,6 @@ class InputStream:
             give_way=self._give_way,
             origin=zenoh.Locality.ANY,
         )
-
-    def give(self, sample: Sample) -> bool:
-        """Carry a sample of this process; it is put in this thread where nothing waits before it (`is_ours`).
-
-        What a full queue or link holds up is this thread, and nobody else: a flip does not wait for it. ``False``: it
-        came behind `end` or `close`, and went nowhere.
-        """
-        with self._giving:
-            try:
-                self._carry(sample, is_given=True)
-            finally:  # also behind Ctrl-C: what is claimed holds up all that follows
-                outlet, self._in_hand = self._in_hand, None
-                if outlet is not None:
-                    outlet.put_claimed()
-            return not self._is_late
 
     def open(self, epoch: int, route: Route, acks: WorkerAcks | None = None, stamps: Stamps | None = None) -> None:
         """Declare the publishers of a slot; it carries nothing yet. With ``acks`` its worker counts what it gets.
@@ -266,22 +246,6 @@ class InputStream:
             del self._slots[epoch]
             self._settle(slot)
             self._end_hold_behind(slot, has_answer)
-
-    def end(self) -> threading.Event:
-        """Take nothing more (`is_ours`), and put the end marker of the slot that is fed behind its last sample.
-
-        The event is set when it has been put.
-        """
-        ended = threading.Event()
-        with self._lock:
-            self._end_hold()  # nobody sends what waits behind a flip once this has ended
-            self._has_end, slot = True, self._active
-            self._send_passed_over(math.inf)
-        if slot is None:
-            ended.set()
-        else:
-            slot.outlet.send_end(slot.epoch, ended.set)
-        return ended
 
     def send_end(self, epoch: int) -> None:
         """Put the end marker behind the slot's last sample (it must not be the active one); may block on its link."""
@@ -542,14 +506,11 @@ class InputStream:
 
     # --- one sample --------------------------------------------------------------------------------------------------
 
-    def _carry(self, sample: Sample, *, is_given: bool = False) -> None:
+    def _carry(self, sample: Sample) -> None:
         active, size = self._active, weight(sample)
         if active is not None and self._is_patient and not self._is_paused:
             active.outlet.wait_for_room(size)
         with self._lock:
-            if is_given and self._has_end:
-                self._is_late = True
-                return
             self._counter.seen(len(sample.payload))
             if self._loop_ids and _is_own(sample, self._loop_ids):
                 self._counter.dropped("loop")
@@ -563,7 +524,7 @@ class InputStream:
             if pace is not None and not pace.passes(line, (sample, stamp, line[1]), monotonic_s()):
                 self._counter.dropped("thinned")
             elif not self._is_paused:
-                self._route_on(sample, stamp, size, place=line[1], is_given=is_given)
+                self._route_on(sample, stamp, size, place=line[1])
             elif self._keep_last:
                 self._counter.unsent += 1
             elif len(self._paused) < MAX_PAUSED and self._paused_bytes + size <= MAX_BYTES // 2:
@@ -578,12 +539,10 @@ class InputStream:
     def _line(self, sample: Sample) -> _Line:
         return str(sample.key_expr), self._places.of(sample) if self._keep_last else 0
 
-    def _route_on(
-        self, sample: Sample, stamp: Timestamp | None, size: int, *, place: int = 0, is_given: bool = False
-    ) -> None:
+    def _route_on(self, sample: Sample, stamp: Timestamp | None, size: int, *, place: int = 0) -> None:
         if self._active is not None:
             self._active.sent = self._number
-            self._send(sample, stamp, size, place=place, is_given=is_given)
+            self._send(sample, stamp, size, place=place)
         elif self._next is not None:
             self._held.append((sample, stamp))
             self._held_bytes += size
@@ -602,32 +561,16 @@ class InputStream:
             self._counter.seen(len(sample.payload))
             self._counter.dropped("overflow")
 
-    def _send(
-        self,
-        sample: Sample,
-        stamp: Timestamp | None,
-        size: int | None = None,
-        *,
-        place: int = 0,
-        is_given: bool = False,
-    ) -> None:
+    def _send(self, sample: Sample, stamp: Timestamp | None, size: int | None = None, *, place: int = 0) -> None:
         if self._active is not None:
             if self._times is not None:
                 self._times.sent(stamp or sample.timestamp)
-            if not is_given or not self._claim(self._active.outlet, sample, stamp):
-                reason, dropped = self._active.outlet.send(sample, stamp, size, place)
-                if dropped:
-                    self._counter.dropped(reason, dropped)
+            reason, dropped = self._active.outlet.send(sample, stamp, size, place)
+            if dropped:
+                self._counter.dropped(reason, dropped)
         if self._mirror is not None:
             self._counter.repeated += 1
             self._counter.dropped(*self._mirror.outlet.send(sample, stamp, size, place))
-
-    def _claim(self, outlet: Outlet, sample: Sample, stamp: Timestamp | None) -> bool:
-        self._in_hand = outlet  # first: Ctrl-C may come in between
-        if outlet.claim(sample, stamp):
-            return True
-        self._in_hand = None
-        return False
 
     def _stamp(self, sample: Sample) -> Timestamp | None:
         """With `OnCrash.REPLAY` every sample has a timestamp, by which its answers are known."""

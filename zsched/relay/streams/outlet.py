@@ -62,10 +62,6 @@ queue has room for them besides its own."""
 SKIP_EPOCH: Final = 0
 """Epoch of a marker that ends nothing: no number below its count will come any more."""
 
-WAITED_S: Final = 0.02
-"""A put in its giver's thread that takes this long has waited for its link..."""
-QUEUED_S: Final = 1.0
-"""...and for this long what follows is left to the queue, so that the giver waits for a full one only."""
 MAX_PATIENT: Final = 3
 """Streams that may wait for room at one time: each holds one of zenoh's receive threads (six by default)."""
 
@@ -126,7 +122,6 @@ class Outlet:
         """Samples taken and not dropped (the stream's lock guards it)..."""
         self._left = 0
         """...and those of them that have left the queue, or could not (our lock)."""
-        self._waited_at: float | None = None
         """When a put that its giver had claimed has waited for its link."""
         self._left_told = 0
         """How much of the tally's `at_most_lost` has been taken."""
@@ -222,35 +217,6 @@ class Outlet:
         dropped = self._queue.send(lane, action, size, (sample, stamp))
         self._handed += 1 - dropped
         return ("overflow", dropped) if dropped else _ALL_WENT
-
-    def claim(self, sample: Sample, stamp: Timestamp | None) -> bool:
-        """Take one sample whose put is left to this thread (`put_claimed`); ``False``: it has to be sent (`send`).
-
-        Of class ``reliable`` only: its publisher may wait, that of ``latest`` never does. Behind a put that has waited
-        the queue takes what comes, for a while.
-        """
-        if self._queue is None or not self._is_reliable or not self._is_open(greets=False):
-            return False
-        if self._waited_at is not None and monotonic_s() - self._waited_at < QUEUED_S:
-            return False
-        lane = self._lane(sample)
-        if lane is None:
-            return False
-        stamp, size = sample.timestamp or stamp, weight(sample)
-        if not self._queue.claim(lambda: self._put(lane, sample, stamp, size), (sample, stamp)):
-            return False
-        self._handed += 1
-        return True
-
-    def put_claimed(self) -> None:
-        """Put the sample that was claimed; may wait for its link (under no lock)."""
-        if self._queue is None:
-            return
-        began = monotonic_s()
-        self._queue.do_claimed()
-        now = monotonic_s()
-        if now - began > WAITED_S:
-            self._waited_at = now
 
     def wait_for_room(self, size: int) -> None:
         """Class ``reliable``: wait while the queue is full and its receiver takes something now and then.

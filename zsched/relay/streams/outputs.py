@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 import zenoh
 from zenoh import CongestionControl, Sample, Session, Timestamp
@@ -58,33 +58,6 @@ _BLOCK: Final = CongestionControl.BLOCK
 _NOBODY: Final[_Publisher] = ("", 0)
 
 
-class Way(Protocol):
-    """Where answers that have passed the gate go: an `Outlet` to the applications, or the application that we are."""
-
-    def also_from(self, from_expr: str) -> None:
-        """Take answers of another owner, too."""
-
-    def key_of(self, sample: Sample) -> str:
-        """The key that a sample goes on under."""
-
-    def send(
-        self, sample: Sample, stamp: Timestamp | None = None, size: int | None = None, place: int = 0
-    ) -> tuple[str, int]:
-        """Take one sample; answers (why something was dropped, how much of it)."""
-
-    def keep_first(self) -> None:
-        """Of each key forget what second and further publishers of it have put."""
-
-    def look_after(self) -> None:
-        """Called now and then."""
-
-    def take_missed(self) -> int:
-        """How many samples single receivers may have missed since the last time."""
-
-    def undeclare(self) -> object:
-        """End it."""
-
-
 class OutputStream:
     """One output rule on this node; slots are named by their epoch."""
 
@@ -96,11 +69,9 @@ class OutputStream:
         wake: Callable[[], None],
         local: Session | None = None,
         times: AnswerTimes | None = None,
-        way: Way | None = None,
     ) -> None:
         """Declare the publisher, on ``local``, the host's own side, if there is one; ``session`` is the fleet's.
 
-        ``way``: what passes goes there, and nothing is published.
         ``wake`` is called (from any thread) when an end marker has come.
 
         Raises:
@@ -113,9 +84,7 @@ class OutputStream:
         self._wake = wake
         self._lock = threading.Lock()
         self._counter = StreamCounter(route.stream)
-        self._outlet: Way = way or Outlet(
-            local or session, route.from_expr, route.to_expr, route.settings, has_crowd=True
-        )
+        self._outlet = Outlet(local or session, route.from_expr, route.to_expr, route.settings, has_crowd=True)
         self._slots: dict[int, OutputSlot] = {}
         self._ends: dict[str, zenoh.Subscriber[None]] = {}
         self._carrier: OutputSlot | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import zenoh
@@ -17,7 +17,6 @@ from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass,
 from zsched.ipc.pipe import encode_end
 from zsched.relay.streams import answers, slots
 from zsched.relay.streams.acks import Acks
-from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.outputs import OutputStream
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
@@ -101,7 +100,7 @@ def test_two_outputs_of_one_key_get_every_answer_each(bench: Bench, stream_class
     other = OutputStream(bench.relay, route, frozenset(), lambda: None)
     other.open(1, route, bench.acks, is_from_start=True)
     other.flip(1, drops_held=False)
-    until(lambda: cast("Outlet", other._outlet).is_matching, "the application hears it")
+    until(lambda: other._outlet.is_matching, "the application hears it")
     for number in range(20):
         bench.put(number)
         until(lambda number=number: heard[-1:] == bench.passed[-1:] == [str(number)], f"{number}")  # type: ignore[misc]
@@ -367,7 +366,7 @@ def test_keys_are_forgotten_and_nothing_of_them_is_lost(bench: Bench, monkeypatc
     passed: list[str] = []
     app = bench.worker.declare_subscriber("robot1/*", lambda s: passed.append(f"{s.key_expr} {s.payload.to_string()}"))
     until(lambda: matches(publishers["a"]), "the relay subscribes")
-    until(lambda: cast("Outlet", stream._outlet).is_matching, "the application hears it")
+    until(lambda: stream._outlet.is_matching, "the application hears it")
 
     def put(name: str, number: int) -> None:
         publisher = publishers[name]

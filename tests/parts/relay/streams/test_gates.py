@@ -300,22 +300,20 @@ def test_what_waits_behind_a_flip_goes_out_when_the_stream_ends(bench: Bench) ->
     got: list[str] = []
     kept = bench.outside.declare_subscriber("edge2/t/in", lambda sample: got.append(sample.payload.to_string()))
     former = bench.outside.declare_subscriber("edge1/t/in", lambda _: None)
-    for end in ("end", "finish"):
-        route, stream = way_in(StreamClass.RELIABLE), bench.flowing(way_in(StreamClass.RELIABLE))
-        publisher = bench.publisher("robot1/in")
-        stream.open(2, replace(route, to_expr="edge2/t/in"))
-        until(lambda stream=stream: stream.is_matching(2), "the next owner subscribes")  # type: ignore[misc]
-        with stream._lock:
-            assert stream._active is not None
-            stream._hold(stream._active, stream._slots[2])
-        publisher.put(end)
-        until(lambda stream=stream: stream.count().messages == 1, "it comes")  # type: ignore[misc]
-        assert not got
-        getattr(stream, end)()
-        until(lambda end=end: got == [end], "it goes on")  # type: ignore[misc]
-        got.clear()
-        stream.close()
-        publisher.undeclare()
+    route, stream = way_in(StreamClass.RELIABLE), bench.flowing(way_in(StreamClass.RELIABLE))
+    publisher = bench.publisher("robot1/in")
+    stream.open(2, replace(route, to_expr="edge2/t/in"))
+    until(lambda: stream.is_matching(2), "the next owner subscribes")
+    with stream._lock:
+        assert stream._active is not None
+        stream._hold(stream._active, stream._slots[2])
+    publisher.put("a sample")
+    until(lambda: stream.count().messages == 1, "it comes")
+    assert not got
+    stream.finish()
+    until(lambda: got == ["a sample"], "it goes on")
+    stream.close()
+    publisher.undeclare()
     kept.undeclare()
     former.undeclare()
 

@@ -553,12 +553,12 @@ def test_what_ends_between_two_data_sessions_is_counted_once(bench: Bench, on_cr
         stream="t/in/0", direction=Direction.INPUT, from_expr="robot1/in", to_expr="edge1/in", settings=settings
     )
     receiver = Receiver(bench.other, bench.relay, "edge1/in")
-    stream = InputStream(bench.relay, route, frozenset(), is_ours=True)
+    sample = bench.sample()
+    stream = InputStream(bench.relay, route, frozenset())
     stream.open(1, route, bench.acks)
     stream.flip(1)
-    sample = bench.sample()
     for _ in range(5):
-        stream.give(sample)
+        stream._carry(sample)
     receiver.greeted()
     receiver.ack(0)
     until(lambda: cared(stream) and receiver.got == [0, 1, 2, 3, 4], "all of them")

@@ -381,10 +381,6 @@ SAMPLES: dict[str, object] = {
             ),
         )
     ),
-    "stream_keys": protocol.StreamKeys(keys=("robot1/jobs", "robot1/plan"), pid=4711),
-    "streams_here": protocol.StreamsHere(fleet="hall", node="robot1"),
-    "streams_taken": protocol.StreamsTaken(keys=("robot1/jobs",)),
-    "daemon_gone": protocol.DaemonGone(),
     "slot_lost": relay_protocol.SlotLost(task="map_merge", epoch=3, owner="edge1", samples=12),
     "slot_ready": events.SlotReady(task="map_merge", epoch=4, is_ready=False),
     "slot_flipped": events.SlotFlipped(task="map_merge", epoch=4, replayed=3),
