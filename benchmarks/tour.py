@@ -69,7 +69,6 @@ ON_PAGE: Final = (
     "explain echo",
     "history echo",
     "drain edge2 --yes -m tour",
-    "rehearse echo --steps move,drain --yes",
 )
 """What the page shows; the recording has every verb."""
 PLACES: Final = (("/state", "/var/lib/zsched"), ("/etc", "/etc/zsched"), ("/run", "/run/zsched"))

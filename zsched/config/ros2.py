@@ -66,13 +66,11 @@ def _action(service: Record) -> Record:
     return Record(
         "a ROS action",
         {
-            "action": Field(Here(_NAME), "The name that the robot's nodes use; a template.", required=True),
+            "action": Field(Here(_NAME), "The name that the robot's nodes use.", required=True),
             "type": Field(
                 Here(Text("a ROS action type", action_type_fault)), "As `nav2_msgs/action/Spin`.", default="`any`"
             ),
-            "worker_action": Field(
-                Here(_NAME), "The name that the worker uses, a ROS node; a template.", required=True
-            ),
+            "worker_action": Field(Here(_NAME), "The name that the worker uses, a ROS node.", required=True),
             "result_timeout_s": Field(
                 Number(0.05, _MAX_TIMEOUT_S, "s"),
                 "How long a goal may work; `timeout_s` is of the other two services.",
@@ -89,11 +87,11 @@ def _entry(what: str, word: str, plain: Record) -> Record:
     return Record(
         what,
         {
-            word: Field(Here(_NAME), "The name that the robot's nodes use; a template.", required=True),
+            word: Field(Here(_NAME), "The name that the robot's nodes use.", required=True),
             "type": Field(Here(Text("a ROS type", fault)), "As `nav_msgs/msg/OccupancyGrid`.", default="`any`"),
             "hash": Field(Here(Text("a type hash", hash_fault)), "As in the key of rmw_zenoh.", default="`any`"),
-            f"worker_{word}": Field(Here(_NAME), "The name that the worker uses, a ROS node; a template."),
-            "worker_key": Field(Here(_KEY), "Or its key, when it is a plain zenoh program; a template."),
+            f"worker_{word}": Field(Here(_NAME), "The name that the worker uses, a ROS node."),
+            "worker_key": Field(Here(_KEY), "Or its key, when it is a plain zenoh program."),
             **rest,
         },
     )

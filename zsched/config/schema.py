@@ -293,8 +293,8 @@ WORKER: Final = Record(
 RULE: Final = Record(
     "a stream rule",
     {
-        "from": Field(Here(_TEMPLATE), "Key that is subscribed to; a template.", required=True),
-        "to": Field(Here(_TEMPLATE), "Key that is published; a template.", required=True),
+        "from": Field(Here(_TEMPLATE), "Key that is subscribed to.", required=True),
+        "to": Field(Here(_TEMPLATE), "Key that is published.", required=True),
         **keys(StreamSettings),
     },
 )
@@ -302,8 +302,8 @@ RULE: Final = Record(
 SERVICE: Final = Record(
     "a service rule",
     {
-        "from": Field(Here(_TEMPLATE), "Key under which the robot's applications ask; a template.", required=True),
-        "to": Field(Here(_TEMPLATE), "Key under which the owner's worker answers; a template.", required=True),
+        "from": Field(Here(_TEMPLATE), "Key under which the robot's applications ask.", required=True),
+        "to": Field(Here(_TEMPLATE), "Key under which the owner's worker answers.", required=True),
         **keys(ServiceSettings),
     },
 )

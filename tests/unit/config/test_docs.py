@@ -9,7 +9,6 @@ import pytest
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.config.schema import SCHEDULING, reference
-from zsched.config.timing import _RELATIONS
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_SCORE,
@@ -30,11 +29,6 @@ def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     aggregate = next(field.default for field in fields(Tuning) if field.name == "aggregate")
     assert SCHEDULING.items["aggregate"].default == f"`{aggregate}`"
     assert SCHEDULING.items["score"].default == f"`{DEFAULT_SCORE}`"
-
-
-def test_relations_between_times_are_the_codes() -> None:
-    for relation in _RELATIONS:
-        assert f"* `{relation.field}` {relation.sign} {relation.formula}: {relation.why}." in DOC
 
 
 def test_the_shown_report_is_what_the_checker_prints() -> None:
