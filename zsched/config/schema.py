@@ -415,10 +415,11 @@ def reference() -> str:
     """The reference of every key as Markdown: one table per section, sections in the order of the file.
 
     `docs/guide/fleet-file.md` holds it, and a test compares the two. Settings that sections share are in the first one;
-    a range alone is of numbers.
+    a range alone is of numbers. The clocks are not in it: docs/design/timing.md has them by their profiles.
     """
     sections: dict[int, tuple[Record, list[str]]] = {}
     _collect(FLEET, "", sections)
+    del sections[id(TIMING)]
     before: dict[str, list[str]] = {}
     return "\n".join(_section(record, paths, before) for record, paths in sections.values())
 
@@ -449,7 +450,8 @@ def _section(record: Record, paths: list[str], before: dict[str, list[str]]) -> 
     heading = ", ".join(f"`{path}`" for path in paths) if paths != [""] else "The file"
     rows = []
     for name, item in record.items.items():
-        takes = _KEYS_BELOW.sub("a mapping", item.block.says()).replace("a number ", "")
+        takes = _KEYS_BELOW.sub("a mapping", item.block.says()).replace("a number ", "").replace("` or `", "`, `")
+        takes = takes.removesuffix(", each a mapping").removesuffix(", each value a mapping")
         default = "required" if item.required else item.default
         rows.append(f"| `{name}` | {takes}{f' ({default})' if default else ''} | {item.doc} |")
     model = max(before, key=lambda name: len(set(before[name]) & set(rows)), default="")

@@ -22,7 +22,6 @@ from zsched.adapters.network.node_ping import Pinged
 from zsched.cli import app
 from zsched.commands.common import say
 from zsched.commands.ping import Question, Way, _lines, _ways
-from zsched.commands.report import render_status
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import fleet_hash
 
@@ -399,14 +398,11 @@ def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest
 # --- what is written about it ----------------------------------------------------------------------------------------
 
 
-def test_the_manual_shows_what_the_program_shows() -> None:
+def test_the_manual_has_the_verbs_and_the_exit_codes() -> None:
     manual = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
-    status = json.loads((RECORDED / "manual.json").read_text())
-    at = time.mktime((2026, 11, 30, 14, 7, 28, 0, 0, -1)) + 0.9
-    assert render_status(status, 100, color=False, at=at) in manual
     for verb in ("up", "init", "status", "tune", "check", "demo", "version"):
         assert f"| `zsched {verb}` |" in manual
-    for code in (0, 1, 2, 3, 4, 5, 78):
+    for code in (0, 1, 2, 3, 4, 5, 10, 75, 78, 79):
         assert f"\n| {code} | " in manual
 
 
