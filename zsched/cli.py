@@ -1,7 +1,6 @@
 """The command line `zsched`: arguments in, exit code out.
 
-Knows: which verbs there are, exit codes. Does not know: their options (`zsched.commands`, files named ``*_verbs``), how
-anything is done. What a verb needs is imported inside it: `status` must answer within 200 ms, and a robot has no numpy.
+Knows: streams, exit codes. Does not know: any verb (`zsched.commands.program` has the table of them).
 
 Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded (no quorum, a task without a
 live owner), 5 timed out, 10 by a plan something would change, 75 the name is another machine's, 78 bad configuration.
@@ -15,26 +14,12 @@ import errno
 import io
 import os
 import sys
-from collections.abc import Callable
 from typing import Annotated, NoReturn
 
 import typer
 
-from zsched.commands import daemon_verbs as daemon
-from zsched.commands import doctor_verbs as doctor
-from zsched.commands import document_verbs as document
-from zsched.commands import fleet_verbs as fleet
-from zsched.commands import member_verbs as member
-from zsched.commands import order_verbs as order
-from zsched.commands import pki_verbs as pki
-from zsched.commands import program_verbs as about
-from zsched.commands import question_verbs as question
-from zsched.commands import stream_verbs as stream
-from zsched.commands import watch_verbs as watch
 from zsched.commands.common import warn
-from zsched.commands.options import add_verb
 from zsched.commands.program import Program
-from zsched.commands.rehearse_verb import rehearse
 from zsched.exits import EXIT_FAILED
 
 EPILOG = (
@@ -78,37 +63,6 @@ UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Why stdout takes no more: the disk behind ``>`` is full, or gone."""
 
 
-GROUPS = (stream.GROUP, member.FLEET, fleet.TASK, fleet.NODE, pki.GROUP, question.METRICS)
-VERBS: tuple[Callable[..., None], ...] = (
-    *(daemon.up, daemon.init, daemon.new, daemon.dev),
-    *(question.status, watch.top, watch.web, watch.record, watch.trace),
-    *(question.explain, question.history, question.events),
-    *(order.move, order.pin, order.unpin, order.pause, order.resume, order.tune),
-    *(order.restart, order.drain, order.undrain),
-    *(member.invite, member.join, member.leave, rehearse),
-    *(doctor.doctor, doctor.ping, doctor.bugreport, question.wait, question.logs),
-    *(document.check, document.apply, document.edit),
-    *(about.version, about.complete, about.install, about.uninstall),
-)
-"""In the order of the help."""
-HIDDEN = ("complete",)
-
-for group in GROUPS:
-    app.add_typer(group)
-for verb in VERBS:
-    add_verb(app, verb, is_hidden=verb.__name__ in HIDDEN)
-
-
-def _leave_out_others(word: str) -> None:
-    """Keep only the verb that is meant: to build the options of all takes as long as to ask a daemon."""
-    commands = [one for one in app.registered_commands if word == (one.name or getattr(one.callback, "__name__", ""))]
-    groups = [
-        one for one in app.registered_groups if one.typer_instance is not None and one.typer_instance.info.name == word
-    ]
-    if (commands or groups or word == "--version") and word not in HIDDEN:  # that one tells of the others
-        app.registered_commands, app.registered_groups = commands, groups
-
-
 STANDARD = ("stdin", "stdout", "stderr")
 """By their descriptors' numbers."""
 
@@ -133,7 +87,6 @@ def open_missing() -> None:
 def main() -> None:
     """The console entry point."""
     open_missing()
-    _leave_out_others("".join(sys.argv[1:2]))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # bars in a terminal without UTF-8
     code: str | int | None = EXIT_FAILED

@@ -18,7 +18,7 @@ import zenoh
 from support.authorities import install, secured
 from zsched.adapters.host.operator_client import ask
 from zsched.commands.ask import Door, _client, _visit, ask_door
-from zsched.commands.orders import user_name
+from zsched.commands.change import user_name
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.messages import Accept, Prepare, Promise

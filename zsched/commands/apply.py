@@ -11,18 +11,18 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from zsched import paths as places
 from zsched.commands.ask import Door
+from zsched.commands.change import OrderView, Plan, asker, check_revision, consent
 from zsched.commands.common import (
     CliError,
     Json,
     check_dangers,
-    check_reason,
-    check_taken,
-    confirm,
     print_json,
-    say,
     warn,
 )
 from zsched.commands.document import (
@@ -32,12 +32,13 @@ from zsched.commands.document import (
     change,
     change_over,
     document_text,
+    fleet_of,
     in_force,
     ordered,
     status_of,
     wait_until_settled,
 )
-from zsched.commands.orders import OrderView, asker
+from zsched.commands.options import Changes, PauseAfterOption
 from zsched.commands.page import cut
 from zsched.commands.rollout import Wave, begun, kept_rollouts, told_in
 from zsched.config.difference import Change, Danger, Effect, difference, wanted_electors, warnings_in_force
@@ -47,7 +48,7 @@ from zsched.config.reader import MAX_FILE_BYTES, render_all
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.struct import Struct, replace
 from zsched.errors import ConfigError
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 from zsched.files import read_regular
 from zsched.runtime.restarts import opens_anew, restarts
 from zsched.runtime.zenoh_file import judged
@@ -62,7 +63,7 @@ PATH_ROOM, VALUE_ROOM = 44, 28
 STDIN = "-"
 
 
-class Plan(Struct, frozen=True, kw_only=True):
+class Draft(Struct, frozen=True, kw_only=True):
     """What is to be agreed, and what follows."""
 
     held: InForce
@@ -107,8 +108,22 @@ def read_text(file: str) -> str:
         raise ConfigError(f"{file}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8") from error
 
 
-def apply(view: OrderView, make: Callable[[InForce], str], file: str, part: Part | None = None) -> int:
-    """Plan the change that ``make`` makes of the document in force, show it, ask, have it agreed; the exit code.
+def apply(
+    said: Changes,
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Fleet file; -: stdin.")],
+    pause_after: PauseAfterOption = None,
+) -> int:
+    """Change the running fleet to what a fleet file says: shows what follows, asks, and has it agreed for all nodes.
+
+    The first one of a fleet agrees the file that its nodes run by. A danger has a name, and --accept takes it.
+    Exits with 1 when the fleet was changed meanwhile, with 4 without a quorum, with 10 when --plan shows a change.
+    """
+    view, text = said.order("apply", file, pause_after=pause_after), read_text(file)
+    return apply_change(view, lambda _held: text, file)
+
+
+def apply_change(view: OrderView, make: Callable[[InForce], str], file: str, part: Part | None = None) -> int:
+    """Draft the change that ``make`` makes of the document in force, show it, ask, have it agreed; the exit code.
 
     ``part``: what it adds, as its file has it.
 
@@ -116,39 +131,37 @@ def apply(view: OrderView, make: Callable[[InForce], str], file: str, part: Part
         CliError: nobody answers, the change is refused, overtaken, or not accepted.
         ConfigError: the new file has faults.
     """
-    check_dangers(view.accepted, DANGERS)
-    check_reason(view.reason)
     held = in_force(view.door)
     return agree(view, make_plan(view.door, held, make(held), file, view, part))
 
 
-def agree(view: OrderView, plan: Plan) -> int:
+def agree(view: OrderView, plan: Draft) -> int:
     """Show a plan, ask, have it agreed; the exit code.
 
     Raises:
         CliError: it is refused, overtaken, or not accepted.
     """
     check_dangers(view.accepted, DANGERS)
-    check_reason(view.reason)
     held = plan.held
-    if view.revision is not None and view.revision != held.revision:
-        raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")
+    check_revision(view, held)
     if plan.warnings and not view.is_json:
         warn(plan.warnings)
     if plan.is_nothing:
-        return _tell(view, plan, "unchanged", held.revision, EXIT_OK)
-    if not view.is_json:
-        (warn if view.is_data else say)(table(plan), indent=6)
-    if view.is_plan:
-        return _tell(view, plan, "planned", held.revision, EXIT_WOULD_CHANGE)
-    check_taken(plan.dangers, view.accepted)
-    confirm(f"Change {held.fleet} for all its nodes?", is_sure=view.is_yes, can_ask=view.words[-1] != STDIN)
-    return _commit(view, plan)
+        return _tell(view, plan, "unchanged", held.revision)
+    shown = Plan(
+        text=table(plan),
+        body=_body(plan, "planned", held.revision),
+        dangers=plan.dangers,
+        question=f"Change {held.fleet} for all its nodes?",
+        can_ask=view.words[-1] != STDIN,
+    )
+    code = consent(view, shown)
+    return _commit(view, plan) if code is None else code
 
 
 def make_plan(
     door: Door, held: InForce, text: str, file: str, view: OrderView | None = None, part: Part | None = None
-) -> Plan:
+) -> Draft:
     """What ``text`` would change, and which dangers are in it; ``view`` says which changed workers wait for a look.
 
     ``part``: what was added to the document, as its file has it.
@@ -177,10 +190,7 @@ def make_plan(
         if pause_after is not None:
             raise CliError(EXIT_FAILED, f"--pause-after: {held.fleet} has no document yet; agree its file first")
         return _first(door, held, text, fleet, warnings)
-    old = check_bytes(document_text(held).encode(), file, folder).fleet
-    if old is None:
-        advice = "update zsched here; `zsched fleet export` shows the document"
-        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
+    old = fleet_of(document_text(held), file, folder)
     status = status_of(door)
     owners = {str(task["name"]): task["owner"] for task in status["tasks"]}
     electors = tuple(name for name, _ in held.electors)
@@ -196,7 +206,7 @@ def make_plan(
     changes = tuple(told_in(one, rollouts) for one in changes)
     dangers = [(one.danger.value, one.warning()) for one in changes if one.danger is not None]
     note = "" if changes or text == held.text else "only comments, blanks or the order of keys differ: nothing notices"
-    return Plan(
+    return Draft(
         held=held,
         text=text,
         fleet=fleet,
@@ -221,7 +231,7 @@ def _restarts(old: Fleet, new: Fleet) -> tuple[tuple[str, str], ...]:
     return tuple((", ".join(names), sentence) for sentence, names in who.items())
 
 
-def _first(door: Door, held: InForce, text: str, fleet: Fleet, warnings: str) -> Plan:
+def _first(door: Door, held: InForce, text: str, fleet: Fleet, warnings: str) -> Draft:
     """The first document: every node is asked which file it goes by.
 
     Raises:
@@ -252,13 +262,13 @@ def _first(door: Door, held: InForce, text: str, fleet: Fleet, warnings: str) ->
     note = f"{held.fleet} goes by the file on each machine; from then on by this one document"
     if silent:
         note += f"\nnot asked, for they do not answer: {', '.join(silent)}; they follow when they are back"
-    return Plan(held=held, text=text, fleet=fleet, changes=(), dangers=dangers, warnings=warnings, note=note)
+    return Draft(held=held, text=text, fleet=fleet, changes=(), dangers=dangers, warnings=warnings, note=note)
 
 
 # --- what is shown ---------------------------------------------------------------------------------------------------
 
 
-def table(plan: Plan) -> str:
+def table(plan: Draft) -> str:
     """What changes, place by place: before -> after, and what follows."""
     head = f"{plan.held.fleet}, revision {plan.held.revision}"
     lines = [f"{head}: {plan.note}" if plan.note else f"{head}:"]
@@ -284,19 +294,21 @@ def _values(one: Change) -> str:
     return f"{before} -> {after}"
 
 
-def _tell(view: OrderView, plan: Plan, outcome: str, revision: int, code: int) -> int:
+def _tell(view: OrderView, plan: Draft, outcome: str, revision: int) -> int:
     """The end of it, for people or as JSON."""
-    out = sys.stderr if view.is_data else sys.stdout
     if view.is_json:
         print_json(_body(plan, outcome, revision))
-    elif outcome == "unchanged":
-        out.write(f"{plan.held.fleet}, revision {revision}: nothing would change\n")
-    elif outcome == "ok":
-        out.write(f"{plan.held.fleet}: revision {revision} is agreed\n")
-    return code
+    else:
+        told = (
+            f", revision {revision}: nothing would change"
+            if outcome == "unchanged"
+            else f": revision {revision} is agreed"
+        )
+        (sys.stderr if view.is_data else sys.stdout).write(f"{plan.held.fleet}{told}\n")
+    return EXIT_OK
 
 
-def _body(plan: Plan, outcome: str, revision: int) -> Json:
+def _body(plan: Draft, outcome: str, revision: int) -> Json:
     changes = [
         {
             "path": one.path,
@@ -319,7 +331,7 @@ def _body(plan: Plan, outcome: str, revision: int) -> Json:
 # --- asking, and agreeing --------------------------------------------------------------------------------------------
 
 
-def _commit(view: OrderView, plan: Plan) -> int:
+def _commit(view: OrderView, plan: Draft) -> int:
     """Have it agreed, one change after another, each on the revision that the one before made.
 
     An elector that leaves the fleet goes first: it would not take a document that does not name it. One that comes, or
@@ -340,7 +352,7 @@ def _commit(view: OrderView, plan: Plan) -> int:
             done = f"{number} of {len(steps)} changes are agreed, up to revision {held.revision}, and the next is not"
             raise CliError(EXIT_TIMED_OUT, f"{done}: {error}; give the command again") from error
         document = held.document if "text" in step else document
-    return _tell(view, plan, "ok", held.revision, EXIT_OK)
+    return _tell(view, plan, "ok", held.revision)
 
 
 def _agreed(step: Json, held: InForce, view: OrderView) -> int:
@@ -360,7 +372,7 @@ def _check_same(held: InForce, document: str) -> None:
         raise CliError(EXIT_FAILED, "another document was agreed meanwhile")
 
 
-def _steps(door: Door, plan: Plan) -> Iterator[Json]:
+def _steps(door: Door, plan: Draft) -> Iterator[Json]:
     """The changes that make the plan true, in their order."""
     there = tuple(name for name, _ in plan.held.electors)
     is_asked = not plan.is_first and (
@@ -380,7 +392,7 @@ def _steps(door: Door, plan: Plan) -> Iterator[Json]:
     yield from ({"remove_elector": name} for name in go if name not in leave)
 
 
-def _unseated(plan: Plan, there: tuple[str, ...]) -> tuple[str, ...]:
+def _unseated(plan: Draft, there: tuple[str, ...]) -> tuple[str, ...]:
     """The electors that the document of before names, too, and that have lost their seats."""
     before = check_bytes(plan.held.text.encode(), "the document in force").fleet if plan.held.text else None
     wanted = () if before is None else wanted_electors(there, before, plan.held.text)

@@ -14,18 +14,21 @@ import tarfile
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.adapters.host.decision_log import FILE_BYTES, NAME, NAMES
 from zsched.clock import wall_ns
 from zsched.commands.common import CliError, Json, harmless_json, print_json, say
 from zsched.commands.doctor import as_json, as_text
+from zsched.commands.options import JsonOption, Machine
 from zsched.commands.page import size
 from zsched.commands.redaction import clean, clean_json, clean_yaml, secrets_of
 from zsched.commands.versions import versions
 from zsched.config.reader import MAX_FILE_BYTES
 from zsched.core.values.struct import Struct, replace
-from zsched.doctor.look import Machine, look
+from zsched.doctor.look import look
 from zsched.doctor.model import Result, Scene
 from zsched.doctor.table import run_all
 from zsched.exits import EXIT_FAILED, EXIT_OK
@@ -50,18 +53,23 @@ class Member(Struct, frozen=True, kw_only=True):
     missing: str = ""
 
 
-def report(machine: Machine, file: Path | None, *, is_json: bool) -> int:
-    """Gather, write, and print what is in it.
+def bugreport(
+    here: Machine,
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE]", help="A new file. [zsched-bugreport-NODE-TIME.tar.gz]")
+    ] = None,
+    json_: JsonOption = False,
+) -> int:
+    """Write one file for the person who looks for a fault: every node's status, the doctor's words, the journal.
 
-    Raises:
-        CliError: the file cannot be written, or is there already.
+    Secrets that a name gives away are taken out. It prints what is in the file.
     """
     now = datetime.fromtimestamp(wall_ns() / 1e9, UTC)
-    scene = look(machine, is_fleet=True)
+    scene = look(here.machine(), is_fleet=True)
     path = file or Path(f"zsched-bugreport-{scene.node}-{now:%Y%m%d-%H%M%S}.tar.gz")
     members = tuple(gathered(scene))
     _write(path, packed(members, path.name.removesuffix(".gz").removesuffix(".tar"), now))
-    if is_json:
+    if json_:
         print_json(_as_json(path, members))
     else:
         for line in _lines(path, members):
@@ -178,3 +186,6 @@ def _lines(path: Path, members: tuple[Member, ...]) -> Iterator[str]:
     for member in members:
         yield f"{member.name:<28} {f'not there: {member.missing}' if member.missing else size(len(member.content))}"
     yield f"{path}: secrets that a name gives away are taken out; read it before you hand it on"
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

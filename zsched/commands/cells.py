@@ -17,10 +17,11 @@ from zsched.commands.ask import Door, ask_door, door_here, door_of, fleet_here
 from zsched.commands.common import CliError, Json, print_json, say
 from zsched.commands.history import SCHEMA as HISTORY
 from zsched.commands.history import TOLD, Past, lines_of, print_lines
+from zsched.commands.options import Asks
 from zsched.commands.report import degradations
 from zsched.core.values.fleet import Fleet
 from zsched.errors import ConfigError
-from zsched.exits import EXIT_DEGRADED, EXIT_OK, EXIT_UNREACHABLE
+from zsched.exits import EXIT_DEGRADED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 
 SCHEMA: Final = "zsched.site/1"
 ALIVE: Final = "alive"
@@ -148,3 +149,13 @@ def _code(cells: list[Json]) -> int:
     if cells and all(cell["error"] is not None for cell in cells):
         return EXIT_UNREACHABLE
     return EXIT_DEGRADED if any(cell["error"] is not None or cell["degraded"] for cell in cells) else EXIT_OK
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def of_site(asked: Asks) -> tuple[Path | None, str | None]:
+    """(folder of sockets, node) of the daemon here, which knows the cells. Raises `CliError`: another one is meant."""
+    if asked.connect is not None or "/" in (asked.node or ""):
+        raise CliError(EXIT_USAGE, "--site asks every cell; leave out --connect and CELL/NODE")
+    return asked.runtime_dir, asked.node

@@ -307,6 +307,14 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f"; did you mean {close[0]}?" if close else f"; there are {', '.join(known) or 'none'}"
 
 
+def check_known(status: Json, kind: str, *names: str | None) -> None:
+    """Refuse tasks or nodes (``kind``) that the fleet has not, with the nearest one (`CliError`, 2)."""
+    known = [str(one["name"]) for one in status[f"{kind}s"]]
+    for name in names:
+        if name is not None and name not in known:
+            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no {kind} {name!r}{nearest(name, known)}")
+
+
 def check_dangers(accepted: Iterable[str], known: Sequence[str]) -> None:
     """Refuse an ``--accept`` that names none of the dangers which a verb knows.
 
@@ -331,7 +339,7 @@ def check_taken(dangers: Iterable[tuple[str, str]], accepted: Iterable[str]) -> 
         raise CliError(EXIT_FAILED, f"nothing was changed; if this may be:\n{lines}\n{again(*names)}")
 
 
-def confirm(question: str, *, is_sure: bool, can_ask: bool = True) -> None:
+def confirm(question: str, *, is_sure: bool, can_ask: bool = True, stream: TextIO | None = None) -> None:
     """Let the operator decide who has not said --yes.
 
     Raises:
@@ -340,10 +348,10 @@ def confirm(question: str, *, is_sure: bool, can_ask: bool = True) -> None:
     if is_sure:
         return
     if not (can_ask and sys.stdin.isatty()):
-        raise CliError(EXIT_USAGE, f"nothing was changed; to change it without being asked:\n{again('--yes')}")
+        raise CliError(EXIT_USAGE, f"nothing was done, for nobody can be asked here; to do it:\n{again('--yes')}")
     sys.stdout.flush()
-    if not says_yes(question, sys.stderr):
-        raise CliError(EXIT_FAILED, "nothing was changed")
+    if not says_yes(question, stream or sys.stderr):
+        raise CliError(EXIT_FAILED, "nothing was done")
 
 
 def told_task(status: Json, task: str) -> Json:

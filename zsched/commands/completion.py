@@ -12,7 +12,9 @@ import os
 from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+import typer
 
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
@@ -116,3 +118,15 @@ def _from_file(kind: str) -> list[str]:
         fleet = load_fleet(places.config_path(None, os.environ))
         return [one.name for one in (fleet.nodes if kind == "nodes" else fleet.tasks)]
     return []
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def complete(
+    ctx: typer.Context,
+    words: Annotated[list[str] | None, typer.Argument(metavar="WORD...", help="Typed so far.")] = None,
+) -> None:
+    """Print what the last word may become, for the scripts that `zsched install` brings."""
+    for word in next_words(ctx.find_root().command, ctx, words or ()):
+        typer.echo(word)

@@ -13,7 +13,9 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched import paths as places
 from zsched.commands.common import CliError, Json, nearest, say, stopped_by_signal, wants_color
@@ -24,7 +26,6 @@ from zsched.core.route.route import routes_for
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec
 from zsched.core.values.model import NodeId, NodeKind, TaskId
 from zsched.core.values.plan import Direction
-from zsched.core.values.struct import Struct
 from zsched.dev.fleet import Addresses, LoopbackFile, on_loopback
 from zsched.dev.nodes import Nodes, shares
 from zsched.dev.run import KEYS, Run
@@ -45,28 +46,27 @@ DEFAULT_JOINS: Final = f"tcp/127.0.0.1:{DATA_PORT}"
 """Where an application joins that is told nothing."""
 
 
-class DevOptions(Struct, frozen=True, kw_only=True):
-    """What the verb was given."""
+def dev(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="FILE", help="Fleet file, or its folder; else ./fleet.yaml.")
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option("--task", metavar="[TASK=]FILE", help="This worker in place of the fleet file's."),
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All that the daemons log.")] = False,
+) -> int:
+    """Run every node of a fleet file on this machine, to try a task of your own; nothing of it stays.
 
-    file: Path | None
-    workers: Sequence[str]
-    is_verbose: bool = False
-
-
-def dev(options: DevOptions) -> int:
-    """Run the fleet until it is ended; the exit code.
-
-    Raises:
-        CliError: there is no such file or task, or the file has none.
-        ConfigError: the fleet file has faults.
-        AdapterError: a node cannot be prepared.
+    It prints where applications join, and starts a worker again when its file is saved. On a terminal keys move the
+    task, kill its owner and load it.
     """
-    file = _file(options.file)
+    file = _file(file)
     fleet = load_fleet(file)
     if not fleet.tasks:
         advice = "write one under `tasks:` (docs/guide/fleet-file.md), or begin with `zsched new python`"
         raise CliError(EXIT_CONFIG, f"{file} has no task, and there is nothing to run; {advice}")
-    commands = _commands(fleet, file, options.workers)
+    commands = _commands(fleet, file, task or ())
     with ExitStack() as stack:
         addresses = _addresses(fleet, stack)
         here = on_loopback(file, addresses, commands)
@@ -80,7 +80,7 @@ def dev(options: DevOptions) -> int:
         with nodes:
             _introduce(fleet, file, nodes, addresses, here)
             _say(f"keys: {KEYS}" if keys.is_there else "no terminal, no keys: Ctrl-C or SIGTERM ends it")
-            run = Run(nodes, Watched(words, folder), say=_say, show=_show, stop=stop, is_verbose=options.is_verbose)
+            run = Run(nodes, Watched(words, folder), say=_say, show=_show, stop=stop, is_verbose=verbose)
             code = run.run(keys)
             _say("ends")
     if nodes.left_behind:
@@ -250,3 +250,6 @@ def _say_to_copy(text: str) -> None:
 
 def _show(status: Json) -> None:
     print(render_status(status, max(shutil.get_terminal_size().columns, NARROW), color=wants_color(False)), flush=True)
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

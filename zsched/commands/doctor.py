@@ -12,11 +12,15 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched import paths as places
 from zsched.commands.ask import name_here
 from zsched.commands.common import Json, print_json, wants_color
+from zsched.commands.options import JsonOption, NoColorOption
+from zsched.commands.options import Machine as Here
 from zsched.commands.page import Page
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Check, Result, Scene, Verdict
@@ -47,16 +51,25 @@ def machine_of(config: Path | None, node: str | None, state_dir: Path | None, ru
     )
 
 
-def diagnose(machine: Machine, *, is_fleet: bool, is_strict: bool, is_json: bool, is_plain: bool) -> int:
-    """Run every check, print what came of each, and return the exit code."""
-    scene = look(machine, is_fleet=is_fleet)
+def doctor(
+    here: Here,
+    fleet: Annotated[bool, typer.Option("--fleet", help="Ask every node, and compare what they say.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on a warning, too.")] = False,
+    json_: JsonOption = False,
+    no_color: NoColorOption = False,
+) -> int:
+    """Look for what is wrong with this machine, its daemon, or the whole fleet, and say what to do.
+
+    Each check says PASS, WARN, FAIL or SKIP, and what it saw. It changes nothing. Exits with 1 on a FAIL.
+    """
+    scene = look(here.machine(), is_fleet=fleet)
     results = run_all(scene)
-    if is_json:
+    if json_:
         print_json(as_json(scene, results))
     else:
         width = max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))
-        sys.stdout.write(as_text(results, width, is_colored=wants_color(is_plain)))
-    bad = (Verdict.FAIL, Verdict.WARN) if is_strict else (Verdict.FAIL,)
+        sys.stdout.write(as_text(results, width, is_colored=wants_color(no_color)))
+    bad = (Verdict.FAIL, Verdict.WARN) if strict else (Verdict.FAIL,)
     return EXIT_FAILED if worst(results) in bad else EXIT_OK
 
 
@@ -99,3 +112,6 @@ def _wrapped(texts: Iterable[str], width: int) -> list[str]:
 
 def _counts(results: Results) -> Counter[Verdict]:
     return Counter(result.verdict for _, result in results)
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

@@ -10,10 +10,12 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, warn
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 
@@ -111,6 +113,21 @@ def document_text(held: InForce) -> str:
         advice = "ask another node with --node, or again in a moment"
         raise CliError(EXIT_FAILED, f"{held.node} has not fetched document {held.document[:12]} yet; {advice}")
     return held.text
+
+
+def fleet_of(text: str, file: str = DOCUMENT, folder: Path | None = None) -> Fleet:
+    """The fleet of a document in force; ``folder``: beside which files are looked for, else beside ``file``.
+
+    Raises:
+        CliError: it has faults for this version.
+    """
+    from zsched.config.load import check_bytes  # noqa: PLC0415 - ruamel.yaml is slow to import
+
+    fleet = check_bytes(text.encode(), file, folder).fleet
+    if fleet is None:
+        advice = "update zsched here; `zsched fleet export` shows the document"
+        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
+    return fleet
 
 
 def status_of(door: Door) -> Json:

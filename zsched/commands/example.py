@@ -8,7 +8,9 @@ from __future__ import annotations
 import shlex
 from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.commands.common import CliError, say, warn
 from zsched.exits import EXIT_FAILED
@@ -34,9 +36,15 @@ def files_of(example: Example) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((EXAMPLES / example.value).iterdir()) if path.is_file()}
 
 
-def give_example(example: Example, folder: Path) -> None:
-    """Write an example, say what is there now, and what comes next. Raises as `write_example`."""
-    for path in write_example(example, folder):
+def new(
+    kind: Annotated[Example, typer.Argument(metavar="KIND", help="python, ros2 or zenoh: which way its worker goes.")],
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where. [the current folder]")] = Path(),
+) -> None:
+    """Write a small task to begin with: a fleet file, a worker, an application (see `zsched dev`).
+
+    Nothing is overwritten.
+    """
+    for path in write_example(kind, folder):
         say(str(path))
     words = shlex.join(("zsched", "dev", *(() if folder == Path() else (str(folder),))))
     warn(f"next: `{words}`; it prints the line that starts the application in another terminal")
@@ -61,3 +69,6 @@ def write_example(example: Example, folder: Path) -> tuple[Path, ...]:
     except OSError as error:
         raise CliError(EXIT_FAILED, f"cannot write {error.filename or folder}: {error.strerror}") from error
     return tuple(folder / name for name in files)
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

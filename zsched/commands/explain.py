@@ -13,11 +13,16 @@ import shutil
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, print_json, warn
-from zsched.commands.history import age_s_of, is_known, is_move, wall_text, when_of, where_of
-from zsched.commands.page import Cell, Page, memory, name_room, short_name, span
+from zsched.commands.common import CliError, Json, print_json, wants_color, warn
+from zsched.commands.history import is_known, is_move, wall_text, when_of, where_of
+from zsched.commands.options import Answers, NoColorOption
+from zsched.commands.page import Cell, Page, age_s_of, memory, name_room, short_name, span
 from zsched.commands.weight_words import shares
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.veto import Filter
@@ -33,45 +38,57 @@ COLUMNS = {"memory": "mem", "network": "net"}
 OUTCOMES = {"stay": "green", "none": "red"}
 
 
-class ExplainView(Struct, frozen=True, kw_only=True):
-    """How an explanation is shown."""
+def explain(
+    asked: Answers,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; not with --replay.")] = None,
+    plan: Annotated[
+        str | None, typer.Option("--plan", metavar="NODE=down", help="Reckon again without that node; 10: it moves.")
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="EPOCH|AGE|TIME", help="The judgement before that, from this machine's log."),
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="NAME", help="Only what this robot sees: its terms, whom it hears.")
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option("--replay", metavar="FILE", help="Judge all of a decision log again (also .gz); 1: one differs."),
+    ] = None,
+    no_color: NoColorOption = False,
+) -> int:
+    """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
 
-    plan: str | None
-    """``NODE=down``: reckon again without that node."""
-    at: str | None = None
-    """An epoch, an age or a time: a judgement of the past."""
-    robot: str | None = None
-    """Only what this robot sees."""
-    is_json: bool
-    is_colored: bool
-
-
-def explain(door: Door, task: str, view: ExplainView) -> int:
-    """Print why a task is where it is; returns the exit code.
-
-    Raises:
-        CliError: nobody answers, there is no such task, node or epoch, or no judgement yet.
+    On an edge, which decides nothing, a robot is asked in its place. With --at 12 it shows the judgement that came
+    before the move to epoch 12, and that move; with an age or a time, the one of that moment.
     """
-    gone = None if view.plan is None else _planned(view.plan)
-    if view.at is not None:
-        body, written = _past(door, task, _point_of(view.at))
+    if (task is None) == (replay is None):
+        raise CliError(EXIT_USAGE, "name a task, or a decision log with --replay FILE")
+    if replay is not None:
+        from zsched.commands.replay import replay as make_again  # noqa: PLC0415 - loads the scheduler
+
+        return make_again(replay, is_json=asked.json_)
+    assert task is not None
+    door, gone = asked.door(), None if plan is None else _planned(plan)
+    if at is not None:
+        body, written = _past(door, task, _point_of(at))
     else:
-        body, written = explanation(door, task) if view.robot is None else _of_robot(door, task, view.robot)
-    if view.robot is not None:
+        body, written = explanation(door, task) if robot is None else _of_robot(door, task, robot)
+    if robot is not None:
         from zsched.commands.judgement import sight  # noqa: PLC0415 - loads the scheduler, which takes as long as this
 
-        body["robot"] = sight(written, view.robot, str(body["node"]))
+        body["robot"] = sight(written, robot, str(body["node"]))
     code = EXIT_OK
     if gone is not None:
         from zsched.commands.judgement import planned  # noqa: PLC0415 - as above
 
         body["plan"] = planned(written, gone)
         code = EXIT_WOULD_CHANGE if body["plan"]["would_move"] else EXIT_OK
-    if view.is_json:
+    if asked.json_:
         print_json(body)
     else:
         width = max(MIN_WIDTH, min(shutil.get_terminal_size((100, 30)).columns, MAX_WIDTH))
-        sys.stdout.write(render(body, width, view.is_colored))
+        sys.stdout.write(render(body, width, wants_color(no_color)))
     return code
 
 
@@ -477,3 +494,6 @@ def _changes(page: Page, body: Json) -> None:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

@@ -7,43 +7,47 @@ agreed (`zsched.commands.document`), what a robot makes of a flag (`zsched.core.
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from enum import StrEnum
+from typing import Annotated, Any, Final
+
+import typer
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, check_dangers, check_taken, nearest, print_json, say, told_task
-from zsched.commands.document import DOCUMENT, InForce, change_over, document_text, in_force, ordered
-from zsched.commands.orders import (
+from zsched.commands.ask import Door
+from zsched.commands.change import (
+    NOTHING,
     OrderView,
+    OverError,
+    Plan,
     Row,
-    begin,
-    check_said,
+    check_revision,
+    consent,
+    counted_before,
     lost_since,
     statuses_of,
-    tell_uncounted,
-    told_losses,
+    told_switch,
+    until,
 )
-from zsched.commands.page import span
-from zsched.commands.report import millis, told_flag
+from zsched.commands.common import CliError, Json, check_dangers, check_known, print_json, say, told_task
+from zsched.commands.document import DOCUMENT, InForce, change_over, document_text, in_force, ordered, status_of
+from zsched.commands.options import Changes, ForOption, Orders
+from zsched.commands.page import duration_s, span
+from zsched.commands.report import told_flag
 from zsched.commands.wait import Condition, missing
 from zsched.config.difference import SEAT_AGAIN, names_electors, unseated
 from zsched.config.load import check_bytes
-from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_USAGE
 
 SCHEMA: Final = "zsched.drain/1"
 DRAIN, INELIGIBLE, LEAVE = "drain", "ineligible", "leave"
-PAUSE_S: Final = 0.2
-"""Between two looks at a node that is drained."""
 STAYS_S: Final = 3.0
 """A task that has not left after this time is reported, with the reason; again when the reason changes."""
 NO_OTHER: Final = "no-other-candidate"
 """The danger: a task would have no candidate left that may get it."""
 SEAT_ADVICE: Final = ", then ".join(f"`{command}`" for command in SEAT_AGAIN) + " mends that"
 """Where a document names an elector that is none."""
-NOTHING: Final = "-"
 TITLES: Final = ("WHAT", "KIND", "NOW", "AFTER")
 BLANK: Final[Json] = dict.fromkeys(
     ("node", "task", "to", "by", "reason", "known_s", "for_s", "revision", "switched_s", "lost", "doubled")
@@ -54,7 +58,6 @@ class DrainOrder(Struct, frozen=True, kw_only=True):
     """Which nodes, and how their drain is watched."""
 
     nodes: tuple[str, ...]
-    is_self: bool = False
     is_detached: bool = False
     deadline_s: float | None = 600.0
     """``None``: wait until they are empty."""
@@ -62,87 +65,113 @@ class DrainOrder(Struct, frozen=True, kw_only=True):
     """``LEAVE``: they give up their seats among the electors, too. ``INELIGIBLE``: they keep what they own."""
     more_rows: tuple[Row, ...] = ()
     """What else follows, in the table of what changes."""
-    is_shown: bool = False
-    """The operator has seen the table, and has agreed."""
 
 
-class _Watch(Struct):
-    """What has been told of a drain so far."""
+class Only(StrEnum):
+    """What a drain keeps from nodes."""
 
-    view: OrderView
-    began: float
-    owners: dict[str, str]
-    """{task: the node that it is to leave}, of those that have not settled elsewhere yet."""
-    before: Mapping[str, Json]
-    """{node: its status before the drain}."""
-    stays: dict[str, str] = field(default_factory=dict)
-    """{task: why it stays, as it was told last}."""
-    empty: set[str] = field(default_factory=set)
-    flagged: set[str] = field(default_factory=set)
-    """Nodes of which the flag has been seen in force."""
-    kind: str = DRAIN
-
-    def tell(self, event: str, text: str, **more: Any) -> None:
-        tell(self.view, event, text, after_s=monotonic_s() - self.began, **more)
+    NEW = "new"
 
 
-def drain(view: OrderView, order: DrainOrder) -> int:
-    """Drain nodes and wait until they are empty, or list the drained ones; returns the exit code.
+def drain(
+    said: Changes,
+    nodes: Annotated[list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes of the fleet.")] = None,
+    self_: Annotated[bool, typer.Option("--self", help="The node that is asked.")] = False,
+    only: Annotated[
+        Only | None, typer.Option("--only", metavar="new", help="new: they get nothing new, and keep what they own.")
+    ] = None,
+    for_: ForOption = None,
+    deadline: Annotated[
+        str, typer.Option("--deadline", metavar="DURATION", help="How long to watch: 90s, 10m, 2h.")
+    ] = "10m",
+    force: Annotated[
+        bool, typer.Option("--force", help="Ignore the deadline: watch until the nodes are empty.")
+    ] = False,
+    detach: Annotated[bool, typer.Option("--detach", help="Do not watch it.")] = False,
+) -> int:
+    """Empty nodes: they get nothing new, and their tasks move away one after another, also pinned ones (not --hard).
+
+    Watches until each node owns nothing and its old slots are closed. The nodes stay drained, over restarts, until
+    `zsched undrain`. A task that nobody else can have stays. Without nodes it lists the drained ones. Exits with 5 at
+    the deadline; the drain goes on all the same.
+    """
+    if self_ and (said.node is not None or said.connect is not None):
+        raise CliError(EXIT_USAGE, "--self is the node of this machine: name the node instead")
+    view = said.order(for_=for_, is_lines=True)
+    status = status_of(view.door)
+    chosen = tuple(dict.fromkeys((*([str(status["node"])] if self_ else ()), *(nodes or ()))))
+    if not chosen:
+        return _list(view, status)
+    order = DrainOrder(
+        nodes=chosen,
+        is_detached=detach or only is Only.NEW,
+        deadline_s=None if force else duration_s(deadline),
+        kind=DRAIN if only is None else INELIGIBLE,
+    )
+    return drain_nodes(view, order, status)
+
+
+def drain_nodes(view: OrderView, order: DrainOrder, status: Json) -> int:
+    """Drain nodes and wait until they are empty; the exit code.
 
     Raises:
-        CliError: nobody answers, there is no such node, no document is agreed, or the drain is not agreed.
+        CliError: there is no such node, no document is agreed, or the drain is not agreed.
     """
-    check_said(view)
-    status = _status(view.door)
-    nodes = _chosen(status, order)
-    if not nodes:
-        return _list(view, status)
+    nodes = order.nodes
+    check_known(status, "node", *nodes)
     held = _held(view)
     after = _with(view, held, order.kind, nodes)
     rows = [_row(status, name, order.kind, after) for name in nodes]
     rows += [] if order.kind == INELIGIBLE else _task_rows(status, nodes, after)
-    danger = _check_dangers(view, status, held.flags, after)
+    check_dangers(view.accepted, (NO_OTHER,))
+    danger = _danger(status, held.flags, after)
+    dangers = [] if danger is None else [(NO_OTHER, danger)]
     owned = [row[0] for row in rows if row[1] == "owner"]
-    plan = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=danger)
+    reason = None if danger is None else f"{NO_OTHER}: {danger}"
+    body = _body("planned", nodes=nodes, revision=held.revision, tasks=owned, reason=reason)
     is_change = after != held.flags
-    if (is_change or view.is_plan) and not order.is_shown:
-        code = begin(view, [*rows, *order.more_rows], plan, is_change=is_change, titles=TITLES, is_line=True)
+    if is_change or view.is_plan:
+        shown = (*rows, *order.more_rows)
+        code = consent(view, Plan(rows=shown, body=body, is_change=is_change, titles=TITLES, dangers=dangers))
         if code is not None:
             return code
-    before, silent = ({}, {}) if order.is_detached else _statuses(view.door, status, nodes)
-    tell_uncounted(silent)
+    before = {} if order.is_detached else counted_before(view.door, status, nodes)
     revision = _commit(view, held, after, f"{order.kind} {', '.join(nodes)}")
     had = "; ".join(f"{row[0]}: {row[2]}" for row in rows if row[1] == order.kind)
     what = f"It is agreed{_endless(held.flags, after)}" if is_change else f"Nothing would change ({had})"
-    watch = ". Ctrl-C ends the watching, not the drain"
+    watch = "Ctrl-C ends the watching, not the drain."
     if order.kind == LEAVE:  # this command does the rest, once the node is empty
-        watch = f". After Ctrl-C the same command goes on, and `zsched undrain {' '.join(nodes)}` takes it back"
-    watch = "" if order.is_detached else watch
-    event = "agreed" if is_change else "unchanged"
-    tell(view, event, f"{what}{watch}.", after_s=0.0, nodes=nodes, revision=revision)
+        watch = f"After Ctrl-C the same command goes on, and `zsched undrain {' '.join(nodes)}` takes it back."
+    text = f"{what}." if order.is_detached else f"{what}. {watch}"
+    tell(view, "agreed" if is_change else "unchanged", text, after_s=0.0, nodes=nodes, revision=revision)
     if order.is_detached:
         return EXIT_OK
-    watching = _Watch(view=view, began=monotonic_s(), owners=_owned(status, nodes), before=before, kind=order.kind)
-    return _watch(watching, nodes, revision, order.deadline_s)
+    watched = _Watch(view, order.kind, nodes, revision, status, before)
+    lacks = until(watched.look, order.deadline_s)
+    return watched.tell_deadline(lacks) if lacks else EXIT_OK
 
 
-def undrain(view: OrderView, nodes: Sequence[str]) -> int:
-    """Take every flag off nodes; returns the exit code.
+def undrain(
+    said: Orders,
+    nodes: Annotated[
+        list[str] | None, typer.Argument(metavar="[NODE]...", help="Nodes; without one: list the drained ones.")
+    ] = None,
+) -> int:
+    """End every drain of nodes: they may get tasks again, when the fleet finds them better.
 
-    Raises:
-        CliError: as of `drain`.
+    Without a node it lists those that are drained.
     """
+    view = said.order(is_lines=True)
+    status = status_of(view.door)
     if not nodes:
-        return _list(view, _status(view.door))
-    check_said(view)
-    status = _status(view.door)
-    _check_nodes(status, nodes)
+        return _list(view, status)
+    check_known(status, "node", *nodes)
     held = _held(view)
     after = tuple(flag for flag in held.flags if flag["subject"] not in nodes)
     gone = {name: [str(flag["kind"]) for flag in held.flags if flag["subject"] == name] for name in nodes}
     rows = [_row(status, name, kind, after) for name, kinds in gone.items() for kind in kinds or [DRAIN]]
-    plan = _body("planned", nodes=nodes, revision=held.revision)
-    code = begin(view, rows, plan, is_change=after != held.flags, titles=TITLES, is_line=True)
+    body = _body("planned", nodes=nodes, revision=held.revision)
+    code = consent(view, Plan(rows=rows, body=body, is_change=after != held.flags, titles=TITLES))
     if code is not None:
         return code
     if after == held.flags:
@@ -234,24 +263,6 @@ def _task_rows(status: Json, nodes: Sequence[str], after: Sequence[Json]) -> Ite
 # --- asking, and agreeing --------------------------------------------------------------------------------------------
 
 
-def _status(door: Door) -> Json:
-    return ask_door(door, {"verb": "status"})
-
-
-def _check_nodes(status: Json, names: Sequence[str]) -> None:
-    known = [str(node["name"]) for node in status["nodes"]]
-    for name in names:
-        if name not in known:
-            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {name!r}{nearest(name, known)}")
-
-
-def _chosen(status: Json, order: DrainOrder) -> tuple[str, ...]:
-    own = (str(status["node"]),) if order.is_self else ()
-    nodes = tuple(dict.fromkeys((*own, *order.nodes)))
-    _check_nodes(status, nodes)
-    return nodes
-
-
 def _held(view: OrderView) -> InForce:
     """The document in force, at the revision that the operator means.
 
@@ -260,8 +271,7 @@ def _held(view: OrderView) -> InForce:
     """
     held = in_force(view.door)
     document_text(held)
-    if view.revision is not None and view.revision != held.revision:
-        raise CliError(EXIT_FAILED, f"revision {view.revision} is overtaken: {held.fleet} has revision {held.revision}")
+    check_revision(view, held)
     return held
 
 
@@ -284,27 +294,16 @@ def _with(view: OrderView, held: InForce, kind: str, nodes: Sequence[str]) -> tu
     return tuple(sorted(flags, key=lambda flag: (flag["subject"], flag["kind"])))
 
 
-def _check_dangers(view: OrderView, status: Json, before: Sequence[Json], after: Sequence[Json]) -> str | None:
-    """The danger that some task loses its last candidate that may get it, in words; a plan shows it.
-
-    Raises:
-        CliError: it is there, and is not accepted by name.
-    """
-    check_dangers(view.accepted, (NO_OTHER,))
+def _danger(status: Json, before: Sequence[Json], after: Sequence[Json]) -> str | None:
+    """What it means that some task loses its last candidate that may get it; ``None``: none does."""
     was, closed = ({flag["subject"] for flag in flags} for flags in (before, after))
     told = [
         str(task["name"])
         for task in status["tasks"]
         if closed.issuperset(task["candidates"]) and not was.issuperset(task["candidates"])
     ]
-    if not told:
-        return None
-    means = f"{', '.join(told)}: no candidate may get it any more; when its owner ends, nobody does it"
-    if view.is_plan and not view.is_json:
-        say(f"{NO_OTHER}: {means}")
-    if not view.is_plan:
-        check_taken([(NO_OTHER, means)], view.accepted)
-    return f"{NO_OTHER}: {means}"
+    means = "no candidate may get it any more; when its owner ends, nobody does it"
+    return f"{', '.join(told)}: {means}" if told else None
 
 
 def _commit(view: OrderView, held: InForce, flags: Sequence[Json], what: str) -> int:
@@ -356,63 +355,91 @@ def is_given_for(reason: str, flag: Json) -> bool:
 # --- watching --------------------------------------------------------------------------------------------------------
 
 
-def _owned(status: Json, nodes: Sequence[str]) -> dict[str, str]:
-    return {str(task["name"]): str(task["owner"]) for task in status["tasks"] if task["owner"] in nodes}
+class _Watch:
+    """What has been told of a drain so far."""
 
+    def __init__(
+        self, view: OrderView, kind: str, nodes: Sequence[str], revision: int, first: Json, before: Mapping[str, Json]
+    ) -> None:
+        self._view, self._kind, self._nodes, self._revision, self._before = view, kind, nodes, revision, before
+        self._began = monotonic_s()
+        owned = [task for task in first["tasks"] if task["owner"] in nodes]
+        self._owners = {str(task["name"]): str(task["owner"]) for task in owned}
+        """{task: the node that it is to leave}, of those that have not settled elsewhere yet."""
+        self._stays: dict[str, str] = {}
+        """{task: why it stays, as it was told last}."""
+        self._empty: set[str] = set()
+        self._flagged: set[str] = set()
+        """Nodes of which the flag has been seen in force."""
 
-def _watch(watch: _Watch, nodes: Sequence[str], revision: int, deadline_s: float | None) -> int:
-    """Look again and again until the nodes are empty, or the deadline has come."""
-    while True:
-        lacks = _look(watch, nodes, revision)
-        if not lacks:
-            return EXIT_OK
-        passed_s = monotonic_s() - watch.began
-        if deadline_s is not None and passed_s >= deadline_s:
-            left = [name for name in nodes if name not in watch.empty]
-            text = f"{', '.join(left)}: not empty after {span(passed_s)}; the {watch.kind} stays in force"
-            watch.tell("deadline", "\n".join((text, *(f"  {lack}" for lack in lacks))), nodes=left, missing=lacks)
-            return EXIT_TIMED_OUT
-        time.sleep(PAUSE_S)
+    def _tell(self, event: str, text: str, **more: Any) -> None:
+        tell(self._view, event, text, after_s=monotonic_s() - self._began, **more)
 
+    def look(self) -> list[str]:
+        """Tell what is new, and say what is missing yet; a node that does not answer now is asked again."""
+        first = status_of(self._view.door)
+        found, silent = statuses_of(self._view.door, first, self._nodes)
+        if silent:
+            return list(silent.values())
+        if int(first["fleet_revision"]) < self._revision:
+            return [f"{first['node']} has not learnt revision {self._revision} yet"]
+        self._check_flagged(first)
+        self._tell_moves(first, found)
+        if monotonic_s() - self._began >= STAYS_S:
+            self._tell_stays(first, found)
+        lacks = []
+        for name in self._nodes:
+            missed = missing(Condition(kind="empty", node=name), found)
+            if not missed and name not in self._empty:
+                self._empty.add(name)
+                until_when = _until(first, name) if self._kind == DRAIN else ""
+                self._tell("empty", f"{name}: empty, and gets nothing new{until_when}", node=name)
+            lacks += missed
+        return lacks
 
-def _look(watch: _Watch, nodes: Sequence[str], revision: int) -> list[str]:
-    """Tell what is new, and say what is missing yet; a node that does not answer now is asked again."""
-    try:
-        first = _status(watch.view.door)
-    except CliError as error:
-        return [str(error)]
-    found, silent = _statuses(watch.view.door, first, nodes)
-    if silent:
-        return list(silent.values())
-    if int(first["fleet_revision"]) < revision:
-        return [f"{first['node']} has not learnt revision {revision} yet"]
-    _check_flagged(watch, first, nodes)
-    _tell_moves(watch, found)
-    _tell_stays(watch, found)
-    lacks = []
-    for name in nodes:
-        missed = missing(Condition(kind="empty", node=name), found)
-        if not missed and name not in watch.empty:
-            watch.empty.add(name)
-            until = _until(first, name) if watch.kind == DRAIN else ""
-            watch.tell("empty", f"{name}: empty, and gets nothing new{until}", node=name)
-        lacks += missed
-    return lacks
+    def tell_deadline(self, lacks: list[str]) -> int:
+        """Say that the time is over; the exit code."""
+        left = [name for name in self._nodes if name not in self._empty]
+        took = span(monotonic_s() - self._began)
+        text = f"{', '.join(left)}: not empty after {took}; the {self._kind} stays in force"
+        self._tell("deadline", "\n".join((text, *(f"  {lack}" for lack in lacks))), nodes=left, missing=lacks)
+        return EXIT_TIMED_OUT
 
+    def _check_flagged(self, status: Json) -> None:
+        """End the watching where the flag of a node that is not empty yet is over: nothing takes its tasks away.
 
-def _check_flagged(watch: _Watch, status: Json, nodes: Sequence[str]) -> None:
-    """End the watching where the flag of a node that is not empty yet is over: nothing takes its tasks away any more.
+        Raises:
+            OverError: somebody has taken it back, or its time is over.
+        """
+        has = {one["name"] for one in status["nodes"] for flag in one.get("flags", ()) if flag["kind"] == self._kind}
+        gone = [name for name in self._nodes if name in self._flagged - self._empty - has]
+        self._flagged |= has
+        if gone and in_force(self._view.door).text:  # without the document it knows no flags
+            raise OverError(EXIT_FAILED, told_over(self._kind, gone))
 
-    Raises:
-        CliError: somebody has taken it back, or its time is over.
-    """
-    has = {
-        str(node["name"]) for node in status["nodes"] for flag in node.get("flags", ()) if flag["kind"] == watch.kind
-    }
-    gone = [name for name in nodes if name in watch.flagged - watch.empty - has]
-    watch.flagged |= has
-    if gone and in_force(watch.view.door).text:  # without the document it knows no flags
-        raise CliError(EXIT_FAILED, told_over(watch.kind, gone))
+    def _tell_moves(self, first: Json, found: Mapping[str, Json]) -> None:
+        """Tell the tasks that have settled elsewhere since the last look."""
+        for task in first["tasks"]:
+            name, to = str(task["name"]), task["owner"]
+            left = self._owners.get(name)
+            if left is None or to in (None, left) or missing(Condition(kind="settled", task=name), found):
+                continue
+            del self._owners[name]
+            tasks = [told_task(status, name) for status in found.values()]
+            switched_s = max(
+                (one["switched_s"] for one in tasks if one and one["switched_s"] is not None), default=None
+            )
+            losses = lost_since(self._before, found, name)
+            text = f"{name}: {left} -> {to}{told_switch(switched_s, None, losses)}"
+            self._tell("moved", text, node=left, task=name, to=to, switched_s=switched_s, **losses)
+
+    def _tell_stays(self, first: Json, found: Mapping[str, Json]) -> None:
+        """Tell the tasks that have not left, with the reason."""
+        for name, node in self._owners.items():
+            why = _why_it_stays(name, found)
+            if told_task(first, name).get("owner") == node and why and why != self._stays.get(name):
+                self._stays[name] = why
+                self._tell("stays", f"{name} stays on {node}: {why}", node=node, task=name, reason=why)
 
 
 def check_in_force(door: Door, kind: str, name: str) -> InForce:
@@ -423,7 +450,7 @@ def check_in_force(door: Door, kind: str, name: str) -> InForce:
     """
     held = in_force(door)
     if held.text and not has_flag(held, kind, name):
-        raise CliError(EXIT_FAILED, told_over(kind, [name]))
+        raise OverError(EXIT_FAILED, told_over(kind, [name]))
     return held
 
 
@@ -444,46 +471,6 @@ def _until(status: Json, name: str) -> str:
     if flag is None or flag["for_s"] is None:
         return f" until `zsched undrain {name}`"
     return f" for {span(max(flag['for_s'] - flag['known_s'], 0.0))}, or until `zsched undrain {name}`"
-
-
-def _statuses(door: Door, first: Json, nodes: Sequence[str]) -> tuple[dict[str, Json], dict[str, str]]:
-    """As `statuses_of`, of all robots and the drained nodes that are alive; the first one is the node at the door."""
-    wanted = [
-        str(node["name"])
-        for node in first["nodes"]
-        if node["state"] == "alive" and (node["kind"] == "robot" or node["name"] in nodes)
-    ]
-    return statuses_of(door, first, list(dict.fromkeys((str(first["node"]), *wanted))))
-
-
-def _tell_moves(watch: _Watch, found: Mapping[str, Json]) -> None:
-    """Tell the tasks that have settled elsewhere since the last look."""
-    first = next(iter(found.values()))
-    for task in first["tasks"]:
-        name = str(task["name"])
-        left = watch.owners.get(name)
-        if left is None or task["owner"] in (None, left) or missing(Condition(kind="settled", task=name), found):
-            continue
-        del watch.owners[name]
-        spans = [one["switched_s"] for status in found.values() for one in status["tasks"] if one["name"] == name]
-        switched_s = max((one for one in spans if one is not None), default=None)
-        took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
-        losses = lost_since(watch.before, found, name)
-        text = f"{name}: {left} -> {task['owner']}{took}{told_losses(losses)}"
-        watch.tell("moved", text, node=left, task=name, to=task["owner"], switched_s=switched_s, **losses)
-
-
-def _tell_stays(watch: _Watch, found: Mapping[str, Json]) -> None:
-    """Tell the tasks that have not left, with the reason."""
-    if monotonic_s() - watch.began < STAYS_S:
-        return
-    first = next(iter(found.values()))
-    owners = {str(task["name"]): task["owner"] for task in first["tasks"]}
-    for name, node in watch.owners.items():
-        why = _why_it_stays(name, found)
-        if owners.get(name) == node and why and why != watch.stays.get(name):
-            watch.stays[name] = why
-            watch.tell("stays", f"{name} stays on {node}: {why}", node=node, task=name, reason=why)
 
 
 def _why_it_stays(name: str, found: Mapping[str, Json]) -> str:

@@ -15,12 +15,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from zsched.commands.apply import apply, read_text
-from zsched.commands.ask import PASSES_ON, Door
+from zsched.commands.apply import apply_change, read_text
+from zsched.commands.ask import PASSES_ON
+from zsched.commands.change import OrderView
 from zsched.commands.common import CliError, Json, print_json, say, warn
 from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.commands.flags import SEAT_ADVICE, without_seat
-from zsched.commands.orders import OrderView
+from zsched.commands.membership import create
+from zsched.commands.options import Answers, Asks, Edits, OutputOption, PauseAfterOption, new_group
+from zsched.commands.recover import recover_fleet
 from zsched.errors import ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.files import replace_regular
@@ -29,16 +32,13 @@ from zsched.screen import harmless, is_screen
 SCHEMA = "zsched.fleet.show/1"
 
 
-def show(door: Door, *, is_json: bool) -> int:
-    """Print the fleet's revision, electors and document, and which node goes by which; the exit code.
-
-    Raises:
-        CliError: nobody answers.
-    """
+def show(asked: Answers) -> int:
+    """Show the fleet's revision, its electors and its document, and which node goes by which."""
+    door = asked.door()
     held = in_force(door)
     names = [str(node["name"]) for node in status_of(door)["nodes"]]
     told = [_row(name, answer) for name, answer in ask_all(door, names, QUESTION).items()]
-    if is_json:
+    if asked.json_:
         electors = [{"name": name, "disk": disk} for name, disk in held.electors]
         body = {"schema": SCHEMA, "fleet": held.fleet, "node": held.node, "revision": held.revision}
         body |= {"number": held.number, "settled": held.is_settled, "document": held.document}
@@ -82,12 +82,9 @@ def _said(held: InForce, one: Json, told: list[Json]) -> str:
     return f"revision {one['revision']}, document {one['document'][:12] or 'none'}{skew}"
 
 
-def export(door: Door, file: Path | None) -> int:
-    """Write the document's text as its operator wrote it, to stdout or to ``file``; the exit code.
-
-    Raises:
-        CliError: nobody answers, there is no document, or the file cannot be written.
-    """
+def export(asked: Asks, file: OutputOption = None) -> int:
+    """Write the document as its operator wrote it, comments and all."""
+    door = asked.door()
     held = in_force(door)
     text = document_text(held)
     if file is None:
@@ -101,7 +98,7 @@ def export(door: Door, file: Path | None) -> int:
     return EXIT_OK
 
 
-def edit(view: OrderView, env: Mapping[str, str] = os.environ) -> int:
+def edit_document(view: OrderView, env: Mapping[str, str] = os.environ) -> int:
     """Open the document in the operator's editor and apply what comes of it; the exit code.
 
     What was typed and is not agreed stays in a file, which is named; Ctrl-C is no exception.
@@ -120,7 +117,7 @@ def edit(view: OrderView, env: Mapping[str, str] = os.environ) -> int:
         return read_text(str(path))
 
     try:
-        code = apply(view, make, "the edited document")
+        code = apply_change(view, make, "the edited document")
     except KeyboardInterrupt:
         if (path := _edited(drafts)) is not None:
             warn(f"\nbroken off; your text is in {path}: zsched apply {shlex.quote(str(path))}")
@@ -183,3 +180,21 @@ def _open_editor(path: Path, env: Mapping[str, str]) -> None:
         raise CliError(EXIT_FAILED, f"the editor {editor!r} cannot be started: {error}; set EDITOR") from error
     if done.returncode:
         raise CliError(EXIT_FAILED, f"the editor {editor!r} ended with {done.returncode}; nothing was changed")
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def edit(said: Edits, pause_after: PauseAfterOption = None) -> int:
+    """Open the fleet's document in your editor (VISUAL, EDITOR, else vi), and apply what comes of it.
+
+    A text with faults, or one that is refused, stays in a file that the message names.
+    """
+    return edit_document(said.order("edit", pause_after=pause_after))
+
+
+fleet = new_group(
+    "fleet",
+    "The document that all nodes of the fleet go by.",
+    {"show": show, "export": export, "create": create, "recover": recover_fleet},
+)

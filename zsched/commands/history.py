@@ -11,11 +11,14 @@ import re
 import time
 from collections.abc import Container, Iterable, Iterator
 from datetime import UTC, datetime
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import Away, CliError, Json, nearest, print_json, say
-from zsched.commands.page import span
+from zsched.commands.common import Away, CliError, Json, check_known, nearest, print_json, say
+from zsched.commands.options import AgeOption, Answers, Local
+from zsched.commands.page import duration_s, span
 from zsched.commands.report import millis
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import shown
@@ -31,8 +34,6 @@ STAGES: Final = ("scheduler", "vote", "executor", "route", "membership", "log")
 TYPES: Final = (MOVE, *STAGES)
 TOLD: Final = ("moves", "rehearsals", "rollouts", "changes")
 """What a history has, beside whose log it is."""
-_DURATION = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)(s|m|h|d)")
-_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 class EventsView(Struct, frozen=True, kw_only=True):
@@ -46,27 +47,6 @@ class EventsView(Struct, frozen=True, kw_only=True):
     """Only lines that name this node."""
     types: tuple[str, ...] = ()
     """Only these types; empty: all."""
-
-
-def duration_s(text: str) -> float:
-    """Seconds of a duration like ``90s``, ``10m``, ``2h``, ``1d``.
-
-    >>> duration_s("10m")
-    600.0
-
-    Raises:
-        CliError: it is none.
-    """
-    seconds = age_s_of(text)
-    if seconds is None:
-        raise CliError(EXIT_USAGE, f"{text!r} is no duration; write it like 90s, 10m, 2h or 1d")
-    return seconds
-
-
-def age_s_of(text: str) -> float | None:
-    """Seconds of a duration; ``None``: it is none."""
-    found = _DURATION.fullmatch(text)
-    return None if found is None else float(found[1]) * _UNITS[found[2]]
 
 
 def subject_of(word: str) -> tuple[str | None, str | None]:
@@ -129,14 +109,37 @@ class Past(Struct, frozen=True, kw_only=True):
 
 
 def history(
-    door: Door, task: str | None, *, is_json: bool, about: str | None = None, since_s: float | None = None
+    asked: Answers,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="Only what was done to it.")] = None,
+    about: Annotated[
+        str | None,
+        typer.Option(
+            "--for", metavar="node/NAME", help="Only moves to this node or away from it, and orders that name it."
+        ),
+    ] = None,
+    since: AgeOption = None,
+    site: Annotated[bool, typer.Option("--site", help="Of every fleet of the site, merged by age.")] = False,
 ) -> int:
-    """Print the moves that the log of the node at the door knows, the newest last; returns the exit code."""
-    past = Past(task=task, about=about, since_s=since_s)
+    """Show every change of owner in a node's decision log: when, from where to where, why, and who voted for it.
+
+    It also tells what operators have changed, with their names.
+
+    With --site one node of each fleet of the site is asked. A fleet that does not answer is named, and the others are
+    shown; exits with 3 when none answers.
+    """
+    of_task, of_node = (None, None) if about is None else subject_of(about)
+    if task is not None and of_task not in (None, task):
+        raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
+    past = Past(task=task or of_task, about=of_node, since_s=None if since is None else duration_s(since))
+    if site:
+        from zsched.commands.cells import of_site, show_histories  # noqa: PLC0415 - only a site has them
+
+        return show_histories(*of_site(asked), past, is_json=asked.json_)
+    door = asked.door()
     told = past.read(door)
     if not any(told[key] for key in TOLD):
         _check_names(door, past)
-    if is_json:
+    if asked.json_:
         print_json({"schema": SCHEMA, **told})
         return EXIT_OK
     lines = lines_of(told)
@@ -152,15 +155,10 @@ def _check_names(door: Door, past: Past) -> None:
     Raises:
         CliError: there is none of that name, or nobody answers.
     """
-    from zsched.commands.document import status_of  # noqa: PLC0415 - loads the values, which showing needs not
-    from zsched.commands.orders import check_name  # noqa: PLC0415 - the same
-
-    if past.task is None and past.about is None:
-        return
-    status = status_of(door)
-    for kind, name in (("task", past.task), ("node", past.about)):
-        if name is not None:
-            check_name(status, kind, name, [str(one["name"]) for one in status[f"{kind}s"]])
+    if past.task is not None or past.about is not None:
+        status = ask_door(door, {"verb": "status"})
+        check_known(status, "task", past.task)
+        check_known(status, "node", past.about)
 
 
 def lines_of(told: Json, before: str = "") -> list[tuple[float, str]]:
@@ -176,7 +174,7 @@ def print_lines(lines: Iterable[tuple[float, str]]) -> None:
         say(text, indent=AGE_COLUMNS)
 
 
-def events(door: Door, view: EventsView) -> int:
+def show_events(door: Door, view: EventsView) -> int:
     """Print what the log tells, the newest last; with ``is_following`` on and on until Ctrl-C."""
     _, now, entries, cursor = read_log(door, is_moves=False)
     since = None if view.since_s is None else now - view.since_s
@@ -353,3 +351,31 @@ def names(entry: Json, node: str) -> bool:
 def wall_text(at: float) -> str:
     """RFC 3339 in UTC, to the millisecond."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def events(
+    asked: Local,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
+    since: AgeOption = None,
+    about: Annotated[
+        str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
+    ] = None,
+    types: Annotated[
+        str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
+) -> int:
+    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
+    of_task, of_node = (None, None) if about is None else subject_of(about)
+    view = EventsView(
+        task=of_task,
+        node=of_node,
+        since_s=None if since is None else duration_s(since),
+        types=() if types is None else types_of(types),
+        is_following=follow,
+        is_json=json_,
+    )
+    return show_events(asked.door(), view)

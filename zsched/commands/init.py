@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched import paths as places
 from zsched.adapters.host.state_file import STATE_NAME
@@ -151,3 +153,22 @@ def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str
     said = f"{asked}, {len(heard.answers)} answered"
     where = f" in generation {generation}" if generation else ""
     return f"{said}: none remembers a vote of {name}{where}" if is_elector else said
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def init(
+    here: Here,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option("--accept", metavar="DANGER", help="lost-state: its state is lost, and no other node is left."),
+    ] = None,
+) -> None:
+    """Create this node's blank state: "this name has never voted here".
+
+    Refuses in another node's folder, and when a node that can be reached knows this name as an elector that has voted.
+    A machine that has lost its state gets the fleet's document first: what `zsched fleet export` writes on a living
+    node, as its fleet file. Where too many states are lost to agree, `zsched fleet recover --generation` begins anew.
+    """
+    create_state(place_of(here), accepted=accept or ())

@@ -13,11 +13,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.adapters.host.state_file import STATE_NAME
 from zsched.commands.common import CliError, say
 from zsched.commands.completion import SCRIPTS, script_file
+from zsched.commands.options import PlanOption
 from zsched.commands.renewing import TIMER, UNIT_FOLDER
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
@@ -103,12 +106,12 @@ class Piece(Struct, frozen=True, kw_only=True):
             raise
 
 
-def install(root: Path, *, is_plan: bool) -> int:
-    """Make what is missing below ``root`` (``/``: this machine), and say each step; nothing is started or enabled.
+def install(plan: PlanOption = False, root: RootOption = Path("/")) -> int:
+    """Let the system find a zsched that pip installed: units, the user, completion, manual pages, the program.
 
-    Raises:
-        CliError: it cannot be done here; nothing is written.
+    It links or copies, says each step, and starts and enables nothing. Once more, it renews what is old.
     """
+    root = root.absolute()
     prefix = Path(sys.prefix)
     _check(prefix, root)
     pieces = list(_pieces(prefix, root))
@@ -120,7 +123,7 @@ def install(root: Path, *, is_plan: bool) -> int:
     missing = [piece for piece in pieces if not piece.is_there()]
     old = _old_pages(prefix, root, pieces)
     needs_users = _is_this_machine(root) and not _has_users(*USERS)
-    if is_plan:
+    if plan:
         _tell("would make ", ((piece.path, piece.what) for piece in missing))
         _tell("would remove ", ((path, OLD_PAGE) for path in old))
         _print([f"would make the users {', '.join(USERS)}"] if needs_users else [])
@@ -142,12 +145,9 @@ def install(root: Path, *, is_plan: bool) -> int:
     return EXIT_OK
 
 
-def uninstall(root: Path, *, is_plan: bool) -> int:
-    """Stop the services and take away what `install` made; what else has these names stays.
-
-    Raises:
-        CliError: it cannot be done here.
-    """
+def uninstall(plan: PlanOption = False, root: RootOption = Path("/")) -> int:
+    """Stop the services and take away what `zsched install` made. Fleet file, state and the program stay."""
+    root = root.absolute()
     prefix = Path(sys.prefix)
     _check(prefix, root)
     pieces = list(_pieces(prefix, root))
@@ -156,7 +156,7 @@ def uninstall(root: Path, *, is_plan: bool) -> int:
     stays = [f"{piece.path}: not zsched's" for piece in pieces if piece.is_in_the_way()]
     stays += [f"{path}: a drop-in that zsched has not made" for path in _other_drop_ins(root, pieces)]
     kept = [Path("/etc/zsched"), Path("/var/lib/zsched"), Path("/var/lib/zsched-workers"), prefix]
-    if is_plan:
+    if plan:
         _print(_still_a_node(root / "var/lib/zsched", is_gone=False))
         _print(["would stop and disable the services"] if any(one.path.name in UNITS for one in ours) else [])
         _tell("would remove ", ((piece.path, piece.what) for piece in ours))
@@ -366,3 +366,11 @@ def _tell(done: str, files: Iterable[tuple[Path, str]]) -> None:
     for (folder, what), names in kinds.items():
         where = folder / names[0] if len(names) == 1 else f"{len(names)} files in {folder}"
         say(f"{done}{where}: {what}")
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+RootOption = Annotated[
+    Path, typer.Option("--root", metavar="DIR", help="Below this folder instead; starts, stops and asks nothing.")
+]

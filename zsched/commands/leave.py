@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.common import CliError, Json, again, check_dangers, check_reason, check_taken, say, warn
+from zsched.commands.change import NOTHING, OrderView, OverError, Plan, Row, check_said, consent, lined, until
+from zsched.commands.common import CliError, Json, again, check_dangers, check_taken, say, warn
 from zsched.commands.document import (
     DOCUMENT,
     HERE,
@@ -28,23 +31,23 @@ from zsched.commands.document import (
     ask_all,
     change,
     document_text,
+    fleet_of,
     in_force,
     ordered,
 )
 from zsched.commands.flags import (
     LEAVE,
     NO_OTHER,
-    NOTHING,
     TITLES,
     DrainOrder,
     check_in_force,
-    drain,
+    drain_nodes,
     has_flag,
     told_over,
 )
 from zsched.commands.membership import Told
-from zsched.commands.orders import OrderView, Row, begin, show_rows
-from zsched.commands.page import span
+from zsched.commands.options import AcceptOption, Files, JsonOption, PlanOption, ReasonOption, RuntimeOption, YesOption
+from zsched.commands.page import duration_s, span
 from zsched.commands.renewing import HOLDS_AUTHORITY, authority_here, bring_advice, left_behind
 from zsched.config.difference import names_electors
 from zsched.config.editing import remove_node
@@ -52,7 +55,7 @@ from zsched.config.load import check_bytes
 from zsched.core.electorate.pilot import may_go
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.problems import Problem, of_kind
-from zsched.core.values.struct import Struct
+from zsched.core.values.struct import Struct, replace
 from zsched.errors import AdapterError, ConfigError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime.membership import Places, Written, belongings, check_ended, is_out, note_out, put_away, whose
@@ -70,30 +73,30 @@ LEARN_S: Final = 10.0
 """How long the other nodes may take to learn that this one is gone."""
 
 
-class _OverError(CliError):
-    """The leave was taken back: going on does not help."""
-
-
 class LeaveOrder(Struct, frozen=True, kw_only=True):
     """What the operator has said."""
 
     places: Places
-    runtime_dir: Path | None = None
-    is_purged: bool = False
-    deadline_s: float = 600.0
-    accepted: tuple[str, ...] = ()
-    """Names of dangers."""
-    reason: str = ""
-    is_plan: bool = False
-    is_yes: bool = False
-    is_json: bool = False
+    is_purged: bool
+    deadline_s: float
+    view: OrderView
+    """Without a door until the daemon is found."""
+
+    @property
+    def is_json(self) -> bool:
+        """Whether programs read it."""
+        return self.view.is_json
+
+    @property
+    def is_plan(self) -> bool:
+        """Whether it is only shown."""
+        return self.view.is_plan
 
 
 class Way(Struct, frozen=True, kw_only=True):
     """One node on its way out."""
 
     order: LeaveOrder
-    view: OrderView
     me: str
     began: float
     files: tuple[Written, ...]
@@ -101,39 +104,66 @@ class Way(Struct, frozen=True, kw_only=True):
     @property
     def door(self) -> Door:
         """To its daemon."""
-        return self.view.door
+        return self.order.view.door
 
     def tell(self, text: str) -> None:
         """A step that is done, for people; programs read the events and the end."""
         if not self.order.is_json:
             say(text)
 
-    def check_time(self, lacks: str) -> None:
-        """End at the deadline.
+    def until(self, look: Callable[[], Iterable[str]], still: str = "") -> None:
+        """Wait until nothing is missing; ``still``: in front of what is.
 
         Raises:
-            CliError: it has come (5).
+            OverError: the leave was taken back.
+            CliError: the deadline has come (5).
         """
-        passed_s = monotonic_s() - self.began
-        if passed_s >= self.order.deadline_s:
+        left_s = self.order.deadline_s - (monotonic_s() - self.began)
+        for lack in until(look, left_s)[:1]:
             advice = f"give `{again()}` again to go on, or take it back: zsched undrain {self.me}"
-            raise CliError(EXIT_TIMED_OUT, f"{self.me} has not left after {span(passed_s)}: {lacks}; {advice}")
+            took = span(monotonic_s() - self.began)
+            raise CliError(EXIT_TIMED_OUT, f"{self.me} has not left after {took}: {still}{lack}; {advice}")
 
 
-def leave(order: LeaveOrder) -> int:
-    """Take this machine out of its fleet; the exit code.
+def leave(
+    here: Files,
+    purge: Annotated[
+        bool,
+        typer.Option("--purge", help="Delete this machine's files of the fleet, its key too; else they are renamed."),
+    ] = False,
+    deadline: Annotated[
+        str, typer.Option("--deadline", metavar="DURATION", help="How long to wait in all: 90s, 10m, 2h.")
+    ] = "10m",
+    accept: AcceptOption = None,
+    reason: ReasonOption = "",
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    json_: JsonOption = False,
+    runtime_dir: RuntimeOption = None,
+) -> int:
+    """Take this machine out of its fleet: its tasks move away, its seat among the electors too, and its daemon ends.
 
-    Raises:
-        CliError: it was not agreed to, a step was not agreed, or the deadline has come (5).
-        ConfigError: without this node the document would have faults.
-        AdapterError: this machine is in no fleet, or its files cannot be put away.
+    Nothing of the others' streams is lost; in a secured fleet they pause while the daemons begin again. Exits with 5 at
+    the deadline: the leave stays in force, and the same command goes on with it; `zsched undrain NODE` takes it back.
+    Another machine is taken out by `zsched node forget`.
     """
-    check_dangers(order.accepted, DANGERS)
-    check_reason(order.reason)
+    accepted = tuple(accept or ())
+    check_dangers(accepted, DANGERS)
+    check_said(reason, None)
+    view = OrderView(
+        door=Door(socket=Path()),
+        is_json=json_,
+        is_yes=yes,
+        is_plan=plan,
+        reason=reason,
+        accepted=accepted,
+        is_lines=True,
+    )
+    order = LeaveOrder(places=here.places(), is_purged=purge, deadline_s=duration_s(deadline), view=view)
     fleet, me = whose(order.places.state)
     files = belongings(order.places, is_purged=order.is_purged)
     try:
-        door = own_door(order, me)
+        door = own_door(runtime_dir, me)
         status = ask_door(door, {"verb": "status"})
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
@@ -141,18 +171,19 @@ def leave(order: LeaveOrder) -> int:
         rows: tuple[Row, ...] = ()
         if not is_out(fleet, me, order.places.state):
             told = f"{error}. The others are not told: `zsched node forget {me}` tells them"
-            accept(order, (NOT_TOLD, told), *authority_danger(order, fleet))
+            accept_all(order, (NOT_TOLD, told), *authority_danger(order, fleet))
             rows = ((me, "member", fleet, NOTHING),)
         else:
             if not order.is_json:
                 say(f"{me} is no node of {fleet} any more, and its daemon has ended")
             _warn(order, authority_danger(order, fleet))  # it has happened: there is nothing to accept
-        code = _asked(view_of(order, Door(socket=Path())), order, fleet, me, files, rows)
+        code = _asked(order, fleet, me, files, rows)
         return _end(order, fleet, me) if code is None else code
     if (status["fleet"], status["node"]) != (fleet, me):
         other = f"{status['node']} of fleet {status['fleet']}"
         raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
-    way = Way(order=order, view=view_of(order, door), me=me, began=monotonic_s(), files=files)
+    order = replace(order, view=replace(view, door=door))
+    way = Way(order=order, me=me, began=monotonic_s(), files=files)
     code = _take_leave(way, status)
     if code != EXIT_OK:
         return code
@@ -160,33 +191,19 @@ def leave(order: LeaveOrder) -> int:
     return _end(order, fleet, me, is_last=[str(one["name"]) for one in status["nodes"]] == [me])
 
 
-def own_door(order: LeaveOrder, me: str) -> Door:
+def own_door(runtime_dir: Path | None, me: str) -> Door:
     """To the daemon of this machine.
 
     Raises:
         CliError: it does not run (3).
     """
-    door = find_door(order.runtime_dir, me)
+    door = find_door(runtime_dir, me)
     if door.node is not None:
         raise CliError(EXIT_UNREACHABLE, f"no daemon of {me} runs on this machine")
     return door
 
 
-def view_of(order: LeaveOrder, door: Door) -> OrderView:
-    """The order as it goes to that daemon."""
-    return OrderView(
-        door=door,
-        is_json=order.is_json,
-        is_yes=order.is_yes,
-        is_plan=order.is_plan,
-        reason=order.reason,
-        accepted=tuple(name for name in order.accepted if name == NO_OTHER),
-    )
-
-
-def _asked(
-    view: OrderView, order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], rows: tuple[Row, ...]
-) -> int | None:
+def _asked(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], rows: tuple[Row, ...]) -> int | None:
     """Show what becomes of this machine, and ask, where no drain does so; the exit code when nothing is to be done now.
 
     ``rows``: what is lost beside the files.
@@ -195,11 +212,10 @@ def _asked(
         CliError: off a terminal, without --yes.
     """
     if order.is_plan:
-        if not order.is_json:
-            show_rows(TITLES, rows)
-        _told(order, fleet, me, files, "planned", f"{me} would leave {fleet}")
-        return EXIT_WOULD_CHANGE
-    return begin(view, (*rows, *map(_file_row, files)), {}, is_change=True, titles=TITLES)
+        for line in lined(TITLES, rows) if not order.is_json else ():
+            say(line)
+        return _told(order, fleet, me, files)
+    return consent(order.view, Plan(rows=(*rows, *map(_file_row, files)), body={}, titles=TITLES))
 
 
 def _file_row(one: Written) -> Row:
@@ -207,14 +223,14 @@ def _file_row(one: Written) -> Row:
     return str(one.path), "file", what, fate
 
 
-def accept(order: LeaveOrder, *dangers: tuple[str, str]) -> None:
+def accept_all(order: LeaveOrder, *dangers: tuple[str, str]) -> None:
     """Go on only if each danger is accepted by its name; each is a name and what it means.
 
     Raises:
         CliError: one is not.
     """
     if not order.is_plan:
-        check_taken(dangers, order.accepted)
+        check_taken(dangers, order.view.accepted)
     _warn(order, dangers)
 
 
@@ -247,28 +263,24 @@ def _take_leave(way: Way, status: Json) -> int:
     danger = _danger(way, status, held, members)
     if danger is not None:
         more = () if danger[0] == LAST else authority_danger(order, held.fleet, held.text)
-        accept(order, danger, *more)
+        accept_all(order, danger, *more)
         return _go_alone(way, held.fleet, None)
     if me not in members:
         way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
         return _go_alone(way, held.fleet, held.revision)
     without(document_text(held), me)  # its faults come before anything is done
-    accept(order, *authority_danger(order, held.fleet, held.text))
+    accept_all(order, *authority_danger(order, held.fleet, held.text))
     rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
     if any(name == me for name, _ in held.electors):
         rows = (*rows, (me, "elector", ", ".join(name for name, _ in held.electors), others_of(held, me)))
-    drained = DrainOrder(
-        nodes=(me,),
-        kind=LEAVE,
-        deadline_s=order.deadline_s,
-        more_rows=rows,
-    )
-    code = drain(way.view, drained)
+    drained = DrainOrder(nodes=(me,), kind=LEAVE, deadline_s=order.deadline_s, more_rows=rows)
+    ours = tuple(name for name in order.view.accepted if name == NO_OTHER)
+    code = drain_nodes(replace(order.view, accepted=ours), drained, status)
     if order.is_plan and code == EXIT_WOULD_CHANGE:
-        return _planned(way, held.fleet)
+        return _told(order, held.fleet, me, way.files)
     if order.is_plan or code != EXIT_OK:
         return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
-    _note(way, held.fleet, _go_out(way, give_up_the_seat(way)))
+    _note(way, held.fleet, _go_out(way, held.fleet, give_up_the_seat(way)))
     return EXIT_OK
 
 
@@ -281,7 +293,7 @@ def _go_alone(way: Way, fleet: str, out: int | None) -> int:
     if out is not None:
         _warn(way.order, authority_danger(way.order, fleet))
     rows: tuple[Row, ...] = () if out is not None else ((me, "member", fleet, NOTHING),)
-    code = _asked(way.view, way.order, fleet, me, way.files, (*rows, (me, "daemon", "runs", "ended")))
+    code = _asked(way.order, fleet, me, way.files, (*rows, (me, "daemon", "runs", "ended")))
     if code is None and out is not None:
         _note(way, fleet, out)
     return EXIT_OK if code is None else code
@@ -291,11 +303,6 @@ def _note(way: Way, fleet: str, revision: int) -> None:
     """Keep that the fleet is without this node, so that the command goes on when it is broken off after the daemon."""
     with contextlib.suppress(AdapterError):  # a full disk keeps nobody from leaving
         note_out(fleet, way.me, revision, way.order.places.state)
-
-
-def _planned(way: Way, fleet: str) -> int:
-    _told(way.order, fleet, way.me, way.files, "planned", f"{way.me} would leave {fleet}")
-    return EXIT_WOULD_CHANGE
 
 
 def others_of(held: InForce, me: str) -> str:
@@ -326,11 +333,7 @@ def members_of(held: InForce, status: Json) -> tuple[str, ...]:
 
 
 def _nodes_of(text: str) -> tuple[str, ...]:
-    fleet = check_bytes(text.encode(), DOCUMENT).fleet
-    if fleet is None:
-        advice = "update zsched here; `zsched fleet export` shows the document"
-        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
-    return tuple(node.name for node in fleet.nodes)
+    return tuple(node.name for node in fleet_of(text).nodes)
 
 
 def _danger(way: Way, status: Json, held: InForce, members: tuple[str, ...]) -> tuple[str, str] | None:
@@ -371,23 +374,28 @@ def give_up_the_seat(way: Way) -> int:
         CliError: the leave was taken back, or the deadline has come (5).
     """
     told = ""
-    while True:
-        told_now = ask_door(way.door, {"verb": "fleet"})
-        if told_now["revision"] is None:  # its daemon has begun anew
-            why = UNKNOWING
-        else:
-            value = from_plain(told_now["value"], FleetValue)
+    since = 0
+
+    def look() -> list[str]:
+        nonlocal told, since
+        answer = ask_door(way.door, {"verb": "fleet"})
+        why = UNKNOWING
+        if answer["revision"] is not None:  # else its daemon has begun anew
+            value = from_plain(answer["value"], FleetValue)
             held = check_in_force(way.door, LEAVE, way.me)
+            since = held.revision
             if may_go(value, way.me):
                 if told:
                     way.tell(f"{way.me}: no elector any more; electors: {', '.join(value.electorate.names)}")
-                return held.revision
+                return []
             why = _ask_for_the_seat(way, held)  # on the revision at which the leave is in force
         if why != told:
             told = why
             way.tell(f"{way.me} is an elector still: {why}")
-        way.check_time(f"it is an elector still: {why}")
-        time.sleep(PAUSE_S)
+        return [why]
+
+    way.until(look, "it is an elector still: ")
+    return since
 
 
 def _ask_for_the_seat(way: Way, held: InForce) -> str:
@@ -403,7 +411,7 @@ def _ask_for_the_seat(way: Way, held: InForce) -> str:
     return "it is removed"
 
 
-def _go_out(way: Way, since: int) -> int:
+def _go_out(way: Way, fleet: str, since: int) -> int:
     """Have this node taken out of the document, and wait until the others know; the revision without it.
 
     One of them proposes it: this node would not store a document that does not name it.
@@ -412,19 +420,17 @@ def _go_out(way: Way, since: int) -> int:
     Raises:
         CliError: the leave was taken back, or the deadline has come (5).
     """
-    for count in itertools.count():
+    turns, revision = itertools.count(), 0
+
+    def look() -> list[str]:
+        nonlocal revision
         others = _alive(way)
-        try:
-            held = in_force(way.door.to(others[count % len(others)]) if others else way.door)
-            revision = _left_out(way, held, since)
-        except _OverError:
-            raise
-        except CliError as error:
-            way.check_time(str(error))
-            time.sleep(PAUSE_S)
-        else:
-            break
-    way.tell(f"{held.fleet}: revision {revision} is agreed, and {way.me} is no node of it")
+        held = in_force(way.door.to(others[next(turns) % len(others)]) if others else way.door)
+        revision = _left_out(way, held, since)
+        return []
+
+    way.until(look)
+    way.tell(f"{fleet}: revision {revision} is agreed, and {way.me} is no node of it")
     _wait_until_known(way, revision)
     return revision
 
@@ -435,7 +441,7 @@ def _left_out(way: Way, held: InForce, since: int) -> int:
     It may be so already: the answer of the try before was lost, or somebody else was first.
 
     Raises:
-        _OverError: the leave was taken back.
+        OverError: the leave was taken back.
         CliError: it is not agreed, or that node is behind.
     """
     text = document_text(held)
@@ -443,7 +449,7 @@ def _left_out(way: Way, held: InForce, since: int) -> int:
         return held.revision
     if not has_flag(held, LEAVE, way.me):
         if held.revision >= since:
-            raise _OverError(EXIT_FAILED, told_over(LEAVE, [way.me]))
+            raise OverError(EXIT_FAILED, told_over(LEAVE, [way.me]))
         raise CliError(EXIT_FAILED, f"{held.node} does not know yet that {way.me} leaves")
     flags = [flag for flag in held.flags if flag["subject"] != way.me]
     what = {"text": without(text, way.me), "flags": flags, "rollouts": list(held.rollouts)}
@@ -461,14 +467,15 @@ def _alive(way: Way) -> list[str]:
 
 def _wait_until_known(way: Way, revision: int) -> None:
     """Wait until the others have that document; a node that does not in time learns it from them."""
-    until = monotonic_s() + LEARN_S
     waiting = _alive(way)
-    while waiting and monotonic_s() < until:
+
+    def look() -> list[str]:
+        nonlocal waiting
         answers = ask_all(way.door, waiting, {"verb": "fleet"})
         waiting = [name for name, answer in answers.items() if not _knows(answer, revision)]
-        if waiting:
-            time.sleep(PAUSE_S)
-    if waiting:
+        return waiting
+
+    if until(look, LEARN_S):
         warn(f"{', '.join(waiting)}: not heard yet that {way.me} has left; the others tell")
 
 
@@ -480,7 +487,7 @@ def _knows(answer: Json | CliError, revision: int) -> bool:
 
 
 def _ordered(way: Way) -> Json:
-    return ordered("leave", {**way.view.asked, "reason": way.order.reason})
+    return ordered("leave", way.order.view.asked)
 
 
 # --- the end ---------------------------------------------------------------------------------------------------------
@@ -493,18 +500,18 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
         CliError: it does not end.
     """
     ask_door(way.door, {"verb": "leave"})
-    until = monotonic_s() + STOP_S
-    while True:
+
+    def look() -> list[str]:
         try:
             check_ended(fleet, way.me, way.order.places)
         except AdapterError as error:
-            if monotonic_s() > until:
-                told = f"{done}, and its daemon does not end: {error}"
-                raise CliError(EXIT_TIMED_OUT, f"{told}; stop it, then give `{again()}` again") from error
-            time.sleep(PAUSE_S)
-        else:
-            way.tell(f"{way.me}: the daemon has ended")
-            return
+            return [str(error)]
+        return []
+
+    for lack in until(look, STOP_S):
+        advice = f"stop it, then give `{again()}` again"
+        raise CliError(EXIT_TIMED_OUT, f"{done}, and its daemon does not end: {lack}; {advice}")
+    way.tell(f"{way.me}: the daemon has ended")
 
 
 def _end(order: LeaveOrder, fleet: str, me: str, *, is_last: bool = False) -> int:
@@ -515,8 +522,7 @@ def _end(order: LeaveOrder, fleet: str, me: str, *, is_last: bool = False) -> in
     if is_last:
         back = f"{fleet} has no node any more; `zsched fleet create NAME` makes a new fleet"
     advice = (back,) if folder is None else (bring_advice(folder, fleet), back)
-    _told(order, fleet, me, done, "left", f"{me} has left {fleet}", advice)
-    return EXIT_OK
+    return _told(order, fleet, me, done, "left", f"{me} has left {fleet}", advice)
 
 
 def _told(
@@ -524,13 +530,14 @@ def _told(
     fleet: str,
     me: str,
     files: tuple[Written, ...],
-    outcome: str,
-    said: str,
+    outcome: str = "planned",
+    said: str = "",
     advice: tuple[str, ...] = (),
-) -> None:
-    """The end of it; ``advice``: what is to be done then."""
+) -> int:
+    """The end of it, or its plan; ``advice``: what is to be done then. The exit code."""
     is_service = order.places.config == paths.SYSTEM_CONFIG
     service = ("sudo systemctl disable zsched: it would find no fleet at the next boot",) if is_service else ()
     more = () if order.is_plan else (*service, *advice)
-    told = Told(fleet=fleet, node=me, outcome=outcome, said=said, files=files, next=more)
-    told.tell(is_json=order.is_json, is_line=True)
+    text = said or f"{me} would leave {fleet}"
+    told = Told(fleet=fleet, node=me, outcome=outcome, said=text, files=files, next=more)
+    return told.tell(is_json=order.is_json, is_line=True)

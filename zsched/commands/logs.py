@@ -11,11 +11,14 @@ import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.clock import monotonic_s, wall_ns
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import Away, CliError, Json, nearest, print_json, warn
+from zsched.commands.common import Away, CliError, Json, check_known, nearest, print_json, warn
+from zsched.commands.options import Answers, TaskArgument
 from zsched.commands.page import clock_time
 from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
@@ -160,11 +163,8 @@ def worker_node(status: Json, task: str, whose: str | None) -> str:
         CliError: there is no such task or node, or nobody owns the task and no node is named.
     """
     tasks = {str(known["name"]): known for known in status["tasks"]}
-    nodes = [str(known["name"]) for known in status["nodes"]]
-    if task not in tasks:
-        raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no task {task!r}{nearest(task, list(tasks))}")
-    if whose is not None and whose not in nodes:
-        raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {whose!r}{nearest(whose, nodes)}")
+    check_known(status, "task", task)
+    check_known(status, "node", whose)
     node = whose or tasks[task]["owner"]
     if node is None:
         able = ", ".join(tasks[task]["candidates"])
@@ -201,3 +201,24 @@ def _print(view: LogsView, node: str, task: str, lines: list[Json]) -> None:
         else:
             sys.stdout.write(f"{clock_time(now - line['age_s'], now)} {line['text']}\n")
     sys.stdout.flush()
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def logs(
+    asked: Answers,
+    task: TaskArgument,
+    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Also what it prints from now on.")] = False,
+    lines: Annotated[int, typer.Option("--lines", min=0, max=400, metavar="N", help="The newest N.")] = 100,
+    level: Annotated[
+        str | None, typer.Option("--level", metavar="LEVEL", help="At least: debug, info, warning, error, critical.")
+    ] = None,
+) -> int:
+    """Show what a task's worker has printed lately, on whichever node it runs.
+
+    A daemon keeps the last 400 lines of each of its workers since its own start; that machine's journal has older ones.
+    """
+    view = LogsView(door=asked.door(), is_json=asked.json_, is_followed=follow, most=lines, level=level)
+    return show_logs(view, task, whose)

@@ -13,15 +13,18 @@ import shlex
 import stat
 import sys
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched import paths as places
-from zsched.commands.apply import apply
+from zsched.commands.apply import apply_change
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
 from zsched.commands.common import CliError, Json, again, check_name, nearest, print_json, say, uninterrupted, warn
-from zsched.commands.document import DOCUMENT, HERE, InForce, document_text, in_force, status_of
-from zsched.commands.orders import OrderView
+from zsched.commands.document import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
+from zsched.commands.options import AcceptOption, Edits, Files, Here, JsonOption, OutputOption, PlanOption
 from zsched.commands.papers import (
     FirstPapers,
     ask_for_certificate,
@@ -33,7 +36,6 @@ from zsched.commands.papers import (
 )
 from zsched.commands.pki import check_held
 from zsched.config.editing import add_entries, add_names, is_list
-from zsched.config.load import check_bytes
 from zsched.core.values.document import Document
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.endpoint import Endpoint, is_loopback
@@ -82,17 +84,19 @@ class Told(Struct, frozen=True, kw_only=True):
     files: tuple[Written, ...] = ()
     next: tuple[str, ...] = ()
 
-    def tell(self, *, is_json: bool, is_line: bool = False) -> None:
-        """Print it; ``is_line``: its JSON on one line, behind others."""
+    def tell(self, *, is_json: bool, is_line: bool = False) -> int:
+        """Print it, and return the exit code; ``is_line``: its JSON on one line, behind others."""
+        code = EXIT_WOULD_CHANGE if self.outcome == "planned" else EXIT_OK
         if is_json:
             files = [{"path": str(one.path), "what": one.what} for one in self.files]
             body: Json = {"schema": SCHEMA, "fleet": self.fleet, "node": self.node, "outcome": self.outcome}
             print_json({**body, "files": files, "next": list(self.next)}, is_line=is_line)
-            return
+            return code
         lines = [self.said, *(f"  {one.path}: {one.what}" for one in self.files)]
         lines += [f"next: {one}" for one in self.next]
         for line in lines:
             say(line, indent=4)
+        return code
 
 
 # --- addresses -------------------------------------------------------------------------------------------------------
@@ -180,6 +184,17 @@ def _entry_of(name: str, kind: NodeKind, address: Address | None, protocol: str)
     return f"  {name}: {{kind: {kind.value}{more}}}\n"
 
 
+class Profile(StrEnum):
+    """The clocks of the protocol."""
+
+    WIRED = "wired"
+    WIFI = "wifi"
+    WAN = "wan"
+
+
+AddressHelp = "HOST or HOST:PORT of its control session; its data session has the next port."
+
+
 # --- create ----------------------------------------------------------------------------------------------------------
 
 
@@ -189,84 +204,74 @@ security: {}
 """
 
 
-class CreateView(Struct, frozen=True, kw_only=True):
-    """The first machine of a new fleet."""
+def create(
+    here: Here,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The new fleet's name.")],
+    kind: Annotated[
+        NodeKind, typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works.")
+    ] = NodeKind.ROBOT,
+    address: Annotated[str | None, typer.Option("--address", metavar="ADDRESS", help=f"{AddressHelp} [found]")] = None,
+    timing: Annotated[Profile, typer.Option("--timing", help="The clocks of the protocol.")] = Profile.WIFI,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Without certificates: whoever reaches the network changes everything.")
+    ] = False,
+    authority: Annotated[
+        Path | None,
+        typer.Option("--authority", metavar="DIR", help="Where the fleet's authority goes. [as of zsched pki]"),
+    ] = None,
+    passphrase: Annotated[
+        bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
+    ] = False,
+    accept: AcceptOption = None,
+    plan: PlanOption = False,
+    json_: JsonOption = False,
+) -> int:
+    """Make this machine the first one of a new fleet: writes its fleet file, state, authority and certificate.
 
-    fleet: str
-    node: str
-    kind: NodeKind
-    timing: str
-    address: str | None
-    places: Places
-    is_secured: bool = True
-    authority: Path | None = None
-    asks_passphrase: bool = False
-    accepted: tuple[str, ...] = ()
-    """Names of dangers."""
-    is_plan: bool = False
-    is_json: bool = False
-
-
-def create(view: CreateView) -> int:
-    """Write the fleet file, document, state and certificate of a fleet of this one machine; the exit code.
-
-    Raises:
-        CliError: no address is found; a name is none (2); without certificates: strangers could reach it.
-        AdapterError: the machine belongs to a fleet already, or a file cannot be written.
-        ConfigError: what comes of the options is no good fleet file.
+    Refused where a fleet file or a state is. A fleet of one works; `zsched invite` brings the next machine.
     """
-    check_name(view.fleet)
-    check_name(view.node, "--node")
-    address = Address(host=own_address()) if view.address is None else address_of(view.address)
-    if not view.is_secured:
-        refuse_open_network((address.host, address.listened_host), view.accepted)
-    papers = _first_papers(view) if view.is_secured else None
+    node, where = places.node_name(here.node, os.environ), here.places()
+    check_name(name)
+    check_name(node, "--node")
+    own = Address(host=own_address()) if address is None else address_of(address)
+    if insecure:
+        refuse_open_network((own.host, own.listened_host), accept or ())
+    papers = None if insecure else FirstPapers(name, node, authority, asks_passphrase=passphrase)
     certify = None if papers is None else papers.certify
-    text = _first_text(view, address)
+    text = (
+        f"fleet: {name}\n"
+        f"timing: {timing}\n"
+        "# Each node dials those before it in this list; `zsched invite` adds to its end.\n"
+        f"seeds: [{node}]\n"
+        "nodes:\n"
+        f"{_entry_of(node, kind, own, 'tcp' if insecure else SECURED)}"
+        "tasks: {}\n"
+        f"{'' if insecure else SECURITY_TEXT}"
+    )
     try:
         with uninterrupted():  # a fleet that is founded by half would be in the way of the next try
-            fleet, files = found(text, view.node, view.places, is_plan=True, certify=certify)
-            before = unfinished(view.places.config)
+            fleet, files = found(text, node, where, is_plan=True, certify=certify)
+            before = unfinished(where.config)
             if papers is not None:
                 papers.check("" if before is None else before.id)
-            if not view.is_plan:
-                fleet, files = found(text, view.node, view.places, is_plan=False, certify=certify)
+            if not plan:
+                fleet, files = found(text, node, where, is_plan=False, certify=certify)
     except ZschedError:
         if papers is not None:
-            papers.destroy(view.places.config)
+            papers.destroy(where.config)
         raise
-    where = f"{address.host}, ports {address.port} and {address.port + 1}"
-    trust = "secured" if view.is_secured else "NOT SECURED: whoever reaches this network reads and changes everything"
-    said = f"{fleet.name}: a fleet of one node, {view.node} at {where}, {trust}"
-    outcome = "planned" if view.is_plan else "created"
+    trust = "NOT SECURED: whoever reaches this network reads and changes everything" if insecure else "secured"
+    said = f"{fleet.name}: a fleet of one node, {node} at {own.host}, ports {own.port} and {own.port + 1}, {trust}"
     more = "`zsched task add FILE` gives it work, `zsched invite NAME > NAME.invite` brings the next machine"
     told = Told(
         fleet=fleet.name,
-        node=view.node,
-        outcome=outcome,
-        said=f"would be written; {said}" if view.is_plan else said,
+        node=node,
+        outcome="planned" if plan else "created",
+        said=f"would be written; {said}" if plan else said,
         files=files if papers is None else (*files, *papers.files),
-        next=() if view.is_plan else (*how_to_start(view.node, view.places), more, *(papers.advice if papers else ())),
+        next=() if plan else (*how_to_start(node, where), more, *(papers.advice if papers else ())),
     )
-    told.tell(is_json=view.is_json)
-    return EXIT_WOULD_CHANGE if view.is_plan else EXIT_OK
-
-
-def _first_papers(view: CreateView) -> FirstPapers:
-    return FirstPapers(view.fleet, view.node, view.authority, asks_passphrase=view.asks_passphrase)
-
-
-def _first_text(view: CreateView, address: Address) -> str:
-    return (
-        f"fleet: {view.fleet}\n"
-        f"timing: {view.timing}\n"
-        "# Each node dials those before it in this list; `zsched invite` adds to its end.\n"
-        f"seeds: [{view.node}]\n"
-        "nodes:\n"
-        f"{_entry_of(view.node, view.kind, address, SECURED if view.is_secured else 'tcp')}"
-        "tasks: {}\n"
-        f"{SECURITY_TEXT if view.is_secured else ''}"
-    )
+    return told.tell(is_json=json_)
 
 
 def how_to_start(node: NodeId, where: Places) -> tuple[str, ...]:
@@ -299,19 +304,46 @@ class Guest(Struct, frozen=True, kw_only=True):
     """For a key that was made on the machine itself."""
 
 
-def invite(view: OrderView, guest: Guest, file: Path | None) -> int:
-    """Have a machine added to the document, and write the file with which it joins; the exit code.
+def invite(
+    said: Edits,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The new machine's name in the fleet.")],
+    kind: Annotated[
+        NodeKind | None,
+        typer.Option("--kind", "--role", help="A robot votes and has streams; an edge only works. [robot]"),
+    ] = None,
+    address: Annotated[
+        str | None, typer.Option("--address", metavar="ADDRESS", help=f"{AddressHelp} [nobody dials it]")
+    ] = None,
+    candidate_for: Annotated[
+        list[str] | None,
+        typer.Option("--candidate-for", metavar="TASK", help="It may own this task; give it once for each."),
+    ] = None,
+    output: OutputOption = None,
+    authority: Annotated[
+        Path | None,
+        typer.Option("--authority", metavar="DIR", help="In a secured fleet: who signs. [as of zsched pki]"),
+    ] = None,
+    csr: Annotated[
+        Path | None,
+        typer.Option("--csr", metavar="FILE", help="In a secured fleet: its request; its key stays where it was made."),
+    ] = None,
+) -> int:
+    """Add a machine to the fleet, and write the file with which it joins (`zsched join`).
 
-    Raises:
-        CliError, ConfigError: as of `zsched.commands.apply.apply`; or the name is taken, or a task is not there.
-        AdapterError: its certificate cannot be made.
+    In a secured fleet the file holds the machine's certificate, and its key unless --csr is given, where this machine
+    has the authority.
+    For a node that was never there it is written once more, with another key: the former one is revoked.
     """
+    guest = Guest(
+        name=name, kind=kind, address=address, tasks=tuple(candidate_for or ()), authority=authority, request=csr
+    )
+    view = said.order("invite", name, is_data=True)
     check_name(guest.name)
-    if file is None and sys.stdout.isatty() and not view.is_plan:
+    if output is None and sys.stdout.isatty() and not view.is_plan:
         raise CliError(EXIT_USAGE, f"the invitation is a file: {again()} > {guest.name}.invite")
-    if file is not None and not os.access(file.parent, os.W_OK):
-        raise CliError(EXIT_FAILED, f"{file}: that folder takes no file; nothing was done, name another one")
-    if file is None and not view.is_plan:
+    if output is not None and not os.access(output.parent, os.W_OK):
+        raise CliError(EXIT_FAILED, f"{output}: that folder takes no file; nothing was done, name another one")
+    if output is None and not view.is_plan:
         _close_to_others()  # before there is anything to read: who opens it now may read on when it is private
     held = in_force(view.door)
     fleet = fleet_of(document_text(held))
@@ -326,14 +358,14 @@ def invite(view: OrderView, guest: Guest, file: Path | None) -> int:
     if listed is not None:
         _check_invited_again(view.door, guest, listed.kind)
         if fleet.security is not None and not set(former) <= set(fleet.security.revoked):
-            code = apply(view, lambda held: _without_keys(document_text(held), former), DOCUMENT)
+            code = apply_change(view, lambda held: _without_keys(document_text(held), former), DOCUMENT)
     else:
-        address = None if guest.address is None else address_of(guest.address)
-        code = apply(view, lambda held: _without_keys(_with_guest(held, guest, address), former), DOCUMENT)
+        own = None if guest.address is None else address_of(guest.address)
+        code = apply_change(view, lambda held: _without_keys(_with_guest(held, guest, own), former), DOCUMENT)
     if code != EXIT_OK:
         return code
     if not view.is_plan:
-        _write(invitation_for(view.door, guest, secret), guest, file)
+        _write(invitation_for(view.door, guest, secret), guest, output)
     return EXIT_OK
 
 
@@ -347,19 +379,6 @@ def _check_invited_again(door: Door, guest: Guest, kind: NodeKind) -> None:
         advice = "without options it gets its invitation once more; `zsched edit` changes what it is"
         told = "an edge" if kind is NodeKind.EDGE else "a robot"
         raise CliError(EXIT_FAILED, f"{guest.name} is in the document already, as {told}; {advice}")
-
-
-def fleet_of(text: str, file: str = DOCUMENT) -> Fleet:
-    """The fleet of a document in force; ``file``: beside which certificates are looked for.
-
-    Raises:
-        CliError: it has faults for this version.
-    """
-    fleet = check_bytes(text.encode(), file).fleet
-    if fleet is None:
-        advice = "update zsched here; `zsched fleet export` shows the document"
-        raise CliError(EXIT_FAILED, f"the document in force has faults for this version of zsched; {advice}")
-    return fleet
 
 
 def _with_guest(held: InForce, guest: Guest, address: Address | None) -> str:
@@ -482,31 +501,51 @@ def _replace(file: Path, text: str) -> None:
 # --- join ------------------------------------------------------------------------------------------------------------
 
 
-def join(file: str, where: Places, *, is_plan: bool, is_json: bool) -> int:
-    """Make this machine the node that an invitation names; the exit code.
+def join(
+    here: Files,
+    file: Annotated[str | None, typer.Argument(metavar="[FILE]", help="What `zsched invite` wrote; -: stdin.")] = None,
+    request: Annotated[
+        str | None,
+        typer.Option("--request", metavar="NAME", help="Before: make a key here, and NAME.csr for `zsched invite`."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="With --request: where it goes. [./NAME.csr]")
+    ] = None,
+    plan: PlanOption = False,
+    json_: JsonOption = False,
+) -> int:
+    """Make this machine the node that an invitation names: writes its fleet file, state and certificate.
 
-    Raises:
-        CliError: the file is no invitation.
-        AdapterError: the machine has files of another fleet or node, or a file cannot be written.
-        ConfigError: the document cannot be used here.
+    With --request the machine makes its key by itself, and no key travels.
+    Nothing of another fleet is touched: it is refused. Start the daemon then; it votes as soon as it hears the others.
     """
+    if (file is None) == (request is None):
+        raise CliError(EXIT_USAGE, "give the invitation's file, or --request NAME before you have one")
+    where = here.places()
+    if request is not None:
+        if plan:
+            raise CliError(EXIT_USAGE, "--plan goes with an invitation: --request writes a key and a request only")
+        return _ask_in(request, where, output, is_json=json_)
+    assert file is not None
+    if output is not None:
+        raise CliError(EXIT_USAGE, "--output goes with --request")
     invitation = read_invitation(file)
     fleet, node = invitation.fleet, invitation.node
     if is_joined(invitation, where):
         if not is_of_a_later_key(invitation, where):
-            return _complete(invitation, where, is_plan=is_plan, is_json=is_json)
+            return _complete(invitation, where, is_plan=plan, is_json=json_)
         with uninterrupted():  # after a power cut the same join goes on
-            read, former, files = take_later_key(invitation, where, is_plan=is_plan)
-        if not is_json and not is_plan:
+            read, former, files = take_later_key(invitation, where, is_plan=plan)
+        if not json_ and not plan:
             warn(f"{node} had the key of an earlier invitation: its files are named *.left, and it joins once more")
         more, files = " once more, with the key of this later invitation", (*former, *files)
     else:
         with uninterrupted():
-            read, files = join_here(invitation, where, is_plan=is_plan)
+            read, files = join_here(invitation, where, is_plan=plan)
         more = f" (generation {invitation.value.generation_id[:8]})"
-    would = "would become" if is_plan else "is"
+    would = "would become" if plan else "is"
     said = f"{fleet}: this machine {would} {node}{more}"
-    return _tell_joined(invitation, where, read, said, files, is_plan=is_plan, is_json=is_json)
+    return _tell_joined(invitation, where, read, said, files, is_plan=plan, is_json=json_)
 
 
 def _tell_joined(
@@ -524,8 +563,7 @@ def _tell_joined(
     follow = () if is_plan else (*_lacking(fleet, invitation), *how_to_start(node, where), *_look(invitation))
     outcome = "planned" if is_plan else "joined"
     told = Told(fleet=invitation.fleet, node=node, outcome=outcome, said=said, files=files, next=follow)
-    told.tell(is_json=is_json)
-    return EXIT_WOULD_CHANGE if is_plan else EXIT_OK
+    return told.tell(is_json=is_json)
 
 
 def _complete(invitation: Invitation, where: Places, *, is_plan: bool, is_json: bool) -> int:
@@ -535,14 +573,13 @@ def _complete(invitation: Invitation, where: Places, *, is_plan: bool, is_json: 
         read, files = mend(invitation, where, is_plan=is_plan)
     if not files:
         said = f"{where.state}: this machine is {node} of fleet {fleet} already: nothing to do"
-        Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
-        return EXIT_OK
+        return Told(fleet=fleet, node=node, outcome="unchanged", said=said).tell(is_json=is_json)
     would = "would be" if is_plan else "is"
     said = f"{fleet}: this machine {would} {node} again, with what was missing; its state is here, and stays"
     return _tell_joined(invitation, where, read, said, files, is_plan=is_plan, is_json=is_json)
 
 
-def request(name: str, where: Places, out: Path | None, *, is_json: bool) -> int:
+def _ask_in(name: str, where: Places, out: Path | None, *, is_json: bool) -> int:
     """Make this machine's key and the request with which it is invited; the exit code.
 
     Raises:
@@ -555,8 +592,7 @@ def request(name: str, where: Places, out: Path | None, *, is_json: bool) -> int
     told = Told(
         fleet="", node=name, outcome="requested", said=f"{name}: a key, and a request", files=files, next=(follow,)
     )
-    told.tell(is_json=is_json)
-    return EXIT_OK
+    return told.tell(is_json=is_json)
 
 
 def read_invitation(file: str) -> Invitation:

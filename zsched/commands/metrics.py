@@ -13,12 +13,15 @@ import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
-from zsched.commands.ask import Door, ask_door
+import typer
+
+from zsched.commands.ask import ask_door
 from zsched.commands.common import CliError, Json, uninterrupted
+from zsched.commands.options import Asks, new_group
 from zsched.commands.report import all_problems, degradations
 from zsched.core.values.problems import Problem, of_kind
 from zsched.errors import ZschedError
@@ -176,23 +179,22 @@ def _value(value: float) -> str:
 # --- the verbs -------------------------------------------------------------------------------------------------------
 
 
-def print_metrics(find: Callable[[], Door]) -> int:
-    """Print the text; returns the exit code."""
-    sys.stdout.write(metrics_text(ask_door(find(), {"verb": "status"})))
+def metrics_print(asked: Asks) -> int:
+    """Print a node's figures in Prometheus' text format."""
+    sys.stdout.write(metrics_text(ask_door(asked.door(), {"verb": "status"})))
     return EXIT_OK
 
 
-def write_metrics(path: Path, find: Callable[[], Door]) -> int:
-    """Write the text to a file, whole or not at all; returns the exit code.
+def metrics_write(
+    asked: Asks,
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="As /var/lib/node_exporter/zsched.prom.")],
+) -> int:
+    """Write them to a file, whole or not at all, for node_exporter's textfile collector.
 
-    Where nobody answers the file says ``zsched_up 0``: figures of before would be taken for today's.
-
-    Raises:
-        CliError: nobody answers, or the file cannot be written (1).
-        ConfigError: this machine has no certificate with which to ask.
+    Where nobody answers the file says zsched_up 0, and this exits with 3.
     """
     try:
-        text = metrics_text(ask_door(find(), {"verb": "status"}))
+        text = metrics_text(ask_door(asked.door(), {"verb": "status"}))
     except ZschedError:
         _replace(path, down_text())
         raise
@@ -216,3 +218,9 @@ def _replace(path: Path, text: str) -> None:
                 raise
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; see its folder") from error
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+metrics = new_group("metrics", "Figures for Prometheus.", {"print": metrics_print, "write": metrics_write})

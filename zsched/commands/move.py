@@ -5,30 +5,28 @@ Knows: what is watched, and for how long. Does not know: how a move is agreed.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Annotated, Any, Final
+
+import typer
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, print_json, say, told_task
-from zsched.commands.document import status_of
-from zsched.commands.orders import (
-    PAUSE_S,
-    OrderView,
-    begin,
-    check_name,
-    check_said,
+from zsched.commands.change import (
+    Plan,
+    agreed,
+    consent,
+    counted_before,
     lost_since,
-    refused,
     statuses_of,
-    tell_uncounted,
-    told_losses,
+    told_switch,
+    until,
 )
+from zsched.commands.common import CliError, Json, check_known, print_json, say, told_task
+from zsched.commands.document import status_of
+from zsched.commands.options import Orders, TaskArgument
 from zsched.commands.page import span
-from zsched.commands.report import millis
 from zsched.commands.wait import Condition, missing
-from zsched.core.values.struct import Struct
 from zsched.core.values.words import meant, shown
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT
 
@@ -37,165 +35,132 @@ GAP_S: Final = 3.0
 """How long a settled move is watched for the new owner's first answers; the relays count once a second."""
 KNOWN_S: Final = 3.0
 """How long a daemon that has just begun may take to hear a living node's profile; nodes publish once a second."""
+BLANK: Final = dict.fromkeys(("epoch", "switched_s", "gap_s", "lost", "doubled"))
 
 
-class MoveOrder(Struct, frozen=True, kw_only=True):
-    """A handover to a named node."""
+def move(
+    said: Orders,
+    task: TaskArgument,
+    to: Annotated[str, typer.Argument(metavar="NODE", help="A candidate of the task.")],
+    origin: Annotated[str | None, typer.Option("--from", metavar="NODE", help="Only if this is the owner.")] = None,
+    detach: Annotated[bool, typer.Option("--detach", help="Do not wait until the streams have settled.")] = False,
+    timeout: Annotated[float, typer.Option(min=0.0, max=3600.0, metavar="S", help="Seconds to wait.")] = 30.0,
+) -> int:
+    """Hand a task over to a node, and wait until its streams have settled there.
 
-    task: str
-    node: str
-    origin: str | None = None
-    is_detached: bool = False
-    timeout_s: float = 30.0
-
-
-def move(view: OrderView, order: MoveOrder) -> int:
-    """Hand a task over and wait until its streams have settled; returns the exit code.
-
-    Raises:
-        CliError: nobody answers, there is no such task or node, or the move is refused.
+    It does not pin: the fleet may move the task again when it has reason to. Exits with 5 when it has not settled in
+    time; it goes on all the same.
     """
-    check_said(view)
-    status = _once_it_is_known(view.door, order.node)
-    known = {str(task["name"]): task for task in status["tasks"]}
-    check_name(status, "task", order.task, list(known))
-    check_name(status, "node", order.node, [str(node["name"]) for node in status["nodes"]])
-    task = known[order.task]
-    request = {
-        "verb": "move",
-        "task": order.task,
-        "target": order.node,
-        "origin": order.origin,
-        "base_revision": meant(view.revision, task["revision"]),
-        **view.asked,
-    }
-    plan = ask_door(view.door, {**request, "plan": True})
-    if plan["outcome"] not in ("ok", "unchanged"):
-        raise refused(order.task, plan)
-    row = (order.task, "owner", str(task["owner"] or "nobody"), order.node)
-    body: Json = {"schema": MOVE_SCHEMA, "task": order.task, "from": task["owner"], "to": order.node, "epoch": None}
-    body |= {"revision": task["revision"], "settled": False, "switched_s": None, "gap_s": None}
-    body |= {"lost": None, "doubled": None}
-    code = begin(view, [row], {**body, "missing": []}, is_change=plan["outcome"] == "ok")
+    view = said.order()
+    status = _once_it_is_known(view.door, to)
+    check_known(status, "task", task)
+    check_known(status, "node", to)
+    before = told_task(status, task)
+    left, base = before["owner"], meant(view.revision, before["revision"])
+    request = {"verb": "move", "task": task, "target": to, "origin": origin, "base_revision": base, **view.asked}
+    planned = agreed(task, ask_door(view.door, {**request, "plan": True}))
+
+    def body(revision: int, **more: Any) -> Json:
+        head = {"schema": MOVE_SCHEMA, "task": task, "from": left, "to": to, "revision": revision, "settled": False}
+        return {**head, **BLANK, "missing": [], **more}
+
+    row = (task, "owner", str(left or "nobody"), to)
+    code = consent(view, Plan(rows=[row], body=body(before["revision"]), is_change=planned["outcome"] == "ok"))
     if code is not None:
         return code
-    before, silent = _robots(view.door, status)
-    tell_uncounted(silent)
-    result = ask_door(view.door, request)
-    if result["outcome"] not in ("ok", "unchanged"):
-        raise refused(order.task, result)
-    watch = not order.is_detached
-    if watch and not view.is_json:
-        say("It is agreed. Ctrl-C ends the watching, not the move.")
-    end = _watch(view.door, order, int(result["revision"])) if watch else _End({}, [])
-    return _tell_move(view, order, str(task["owner"] or ""), result, before, end)
+    known = counted_before(view.door, status)
+    revision = int(agreed(task, ask_door(view.door, request))["revision"])
+    end = _End(task, to, revision)
+    if not detach:
+        if not view.is_json:
+            say("It is agreed. Ctrl-C ends the watching, not the move.")
+        until(lambda: end.look(view.door), timeout)
+    measured = end.measured(known)
+    if view.is_json:
+        print_json(body(revision, settled=bool(end.found) and not end.lacks, **measured, missing=end.lacks))
+    else:
+        end.tell(timeout, measured)
+    return EXIT_FAILED if end.has_left else EXIT_TIMED_OUT if end.lacks else EXIT_OK
 
 
 def _once_it_is_known(door: Door, target: str) -> Json:
     """The status, as soon as it has a profile of the target, if that node lives; after `KNOWN_S` as it is."""
-    began = monotonic_s()
-    while True:
-        status = status_of(door)
-        node = next((node for node in status["nodes"] if node["name"] == target), None)
-        is_awaited = node is not None and node["state"] == "alive" and node["cpu_cores"] is None
-        if not is_awaited or monotonic_s() - began >= KNOWN_S:
-            return status
-        time.sleep(PAUSE_S)
+    status, is_old = status_of(door), False
+
+    def awaited() -> list[str]:
+        nonlocal status, is_old
+        status, is_old = status_of(door) if is_old else status, True
+        nodes = [one for one in status["nodes"] if one["name"] == target]
+        return [target for one in nodes if one["state"] == "alive" and one["cpu_cores"] is None]
+
+    until(awaited, KNOWN_S)
+    return status
 
 
-class _End(NamedTuple):
+class _End:
     """How a move stands: every robot's status, and what is missing yet."""
 
-    found: dict[str, Json]
-    lacks: list[str]
-    has_left: bool = False
-    """The task is with another owner since, or with nobody; `lacks` says so."""
+    def __init__(self, task: str, node: str, revision: int) -> None:
+        self._task, self._node, self._revision = task, node, revision
+        self._settled_at: float | None = None
+        self.found: dict[str, Json] = {}
+        self.lacks: list[str] = []
+        self.has_left = False
+        """The task is with another owner since, or with nobody; `lacks` says so."""
 
-
-def _watch(door: Door, order: MoveOrder, revision: int) -> _End:
-    """How the move stands once it is over, or the time is."""
-    began, settled_at = monotonic_s(), None
-    while True:
-        end = _look(door, order, revision)
+    def look(self, door: Door) -> list[str]:
+        """What it is watched for yet; a node that does not answer now is asked again."""
+        try:
+            first = status_of(door)
+        except CliError as error:
+            self.lacks = [str(error)]
+            raise
+        self.found, silent = statuses_of(door, first)
+        self.lacks = [*missing(Condition(kind="settled", task=self._task), self.found), *silent.values()]
+        task = told_task(first, self._task)
+        if task and task["revision"] < self._revision:
+            self.lacks.append(f"{self._task}: {first['node']} has not learnt revision {shown(self._revision)}")
+        elif task and task["owner"] != self._node:
+            owner = f"{task['owner'] or 'nobody'} owns it (epoch {shown(task['epoch'])})"
+            self.lacks, self.has_left = [f"{self._task}: {owner}; `zsched history` tells why"], True
+            return []
         now = monotonic_s()
-        settled_at = (settled_at or now) if not end.lacks else None
-        is_measured = settled_at is not None and (not unmeasured(end.found, order.task) or now - settled_at >= GAP_S)
-        if is_measured or end.has_left or now - began >= order.timeout_s:
-            return end
-        time.sleep(PAUSE_S)
+        self._settled_at = None if self.lacks else self._settled_at or now
+        is_early = self._settled_at is not None and now - self._settled_at < GAP_S
+        return self.lacks or (unmeasured(self.found, self._task) if is_early else [])
 
+    def measured(self, before: Mapping[str, Json]) -> Json:
+        """What the robots have measured of it."""
+        tasks = [task for status in self.found.values() if (task := told_task(status, self._task))]
 
-def _look(door: Door, order: MoveOrder, revision: int) -> _End:
-    """How the move stands; a node that does not answer now is asked again."""
-    try:
-        first = status_of(door)
-    except CliError as error:
-        return _End({}, [str(error)])
-    found, silent = _robots(door, first)
-    lacks = missing(Condition(kind="settled", task=order.task), {str(first["node"]): first, **found})
-    task = told_task(first, order.task)
-    if task and task["revision"] < revision:
-        lacks.append(f"{order.task}: {first['node']} has not learnt revision {shown(revision)}")
-    elif task and task["owner"] != order.node:
-        owner = f"{task['owner'] or 'nobody'} owns it (epoch {shown(task['epoch'])})"
-        return _End(found, [f"{order.task}: {owner}; `zsched history` tells why"], has_left=True)
-    return _End(found, [*lacks, *silent.values()])
+        def most(key: str) -> Any:
+            return max((task[key] for task in tasks if task.get(key) is not None), default=None)
+
+        told = {key: most(key) for key in ("epoch", "switched_s", "gap_s")}
+        return {**told, **lost_since(before, self.found, self._task)}
+
+    def tell(self, timeout_s: float, measured: Json) -> None:
+        """Say it to people."""
+        name = self._task
+        if self.lacks:
+            what = f"it was given to {self._node}, and has left it again"
+            say(f"{name}: {what if self.has_left else f'not settled after {span(timeout_s)}'}")
+            for lack in self.lacks:
+                say(f"  {lack}", indent=4)
+            if not self.has_left:
+                say("the move stands; `zsched status` on such a node names what it waits for")
+        elif not self.found:
+            say(f"{name}: revision {shown(self._revision)} is agreed; `zsched wait --for settled={name}`")
+        else:
+            took = told_switch(measured["switched_s"], measured["gap_s"], measured)
+            say(f"{name}: settled on {self._node}{took}")
 
 
 def unmeasured(statuses: Mapping[str, Json], name: str) -> list[str]:
     """The robots at which answers flow, and the new owner's first one is not told yet."""
-    found = []
-    for node, status in statuses.items():
-        task = told_task(status, name)
-        if not task:
-            continue
-        flows = [stream for stream in task["streams"] if stream.get("gap_s") is not None]
-        if flows and task.get("gap_s") is None:
-            found.append(node)
-    return found
-
-
-def _robots(door: Door, status: Json) -> tuple[dict[str, Json], dict[str, str]]:
-    """As `statuses_of`, of all robots that are alive."""
-    alive = [str(node["name"]) for node in status["nodes"] if node["kind"] == "robot" and node["state"] == "alive"]
-    return statuses_of(door, status, alive)
-
-
-def _tell_move(
-    view: OrderView,
-    order: MoveOrder,
-    left: str,
-    result: Json,
-    before: Mapping[str, Json],
-    end: _End,
-) -> int:
-    found, lacks = end.found, end.lacks
-    tasks = [task for status in found.values() for task in status["tasks"] if task["name"] == order.task]
-    switched = [task["switched_s"] for task in tasks if task.get("switched_s") is not None]
-    switched_s = max(switched, default=None)
-    gap_s = max([task["gap_s"] for task in tasks if task.get("gap_s") is not None], default=None)
-    losses = lost_since(before, found, order.task)
-    epoch = max([int(task["epoch"]) for task in tasks], default=None)
-    if view.is_json:
-        body = {"schema": MOVE_SCHEMA, "task": order.task, "from": left or None, "to": order.node, "epoch": epoch}
-        body |= {"revision": result["revision"], "settled": bool(found) and not lacks, "switched_s": switched_s}
-        body |= {"gap_s": gap_s}
-        print_json({**body, **losses, "missing": list(lacks)})
-    elif end.has_left:
-        say(f"{order.task}: it was given to {order.node}, and has left it again")
-        for lack in lacks:
-            say(f"  {lack}", indent=4)
-    elif lacks:
-        say(f"{order.task}: not settled after {span(order.timeout_s)}")
-        for lack in lacks:
-            say(f"  {lack}", indent=4)
-        say("the move stands; `zsched status` on such a node names what it waits for")
-    elif not found:
-        say(f"{order.task}: revision {shown(result['revision'])} is agreed; `zsched wait --for settled={order.task}`")
-    else:
-        took = "" if switched_s is None else f", streams switched in {millis(switched_s)}"
-        took += "" if gap_s is None else f", answers at most {millis(gap_s)} apart"
-        say(f"{order.task}: settled on {order.node}{took}{told_losses(losses)}")
-    if end.has_left:
-        return EXIT_FAILED
-    return EXIT_TIMED_OUT if lacks else EXIT_OK
+    tasks = {node: told_task(status, name) for node, status in statuses.items()}
+    return [
+        node
+        for node, task in tasks.items()
+        if task and task.get("gap_s") is None and any(one.get("gap_s") is not None for one in task["streams"])
+    ]

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from zsched.commands.common import Verb, Verbs
+from zsched.exits import EXIT_OK
 
 if TYPE_CHECKING:
     from zsched.commands.ask import Door
-    from zsched.commands.orders import OrderView
+    from zsched.commands.change import OrderView
     from zsched.doctor import look as doctor
     from zsched.runtime.membership import Places
 
@@ -142,17 +143,17 @@ class Consents(Answers):
     yes: YesOption = False
     reason: ReasonOption = ""
 
-    def order(
-        self, *words: str, for_: str | None = None, pause_after: int | None = None, is_data: bool = False
-    ) -> OrderView:
+    def order(self, *words: str, for_: str | None = None, pause_after: int | None = None, **more: bool) -> OrderView:
         """The order, or the change of the document that ``words`` make; ``for_``: how long it holds.
 
         Raises:
             CliError: that is no time, or no daemon is there.
         """
-        from zsched.commands.history import duration_s  # noqa: PLC0415 - as above
-        from zsched.commands.orders import OrderView  # noqa: PLC0415 - as above
+        from zsched.commands.change import OrderView, check_said  # noqa: PLC0415 - as above
+        from zsched.commands.page import duration_s  # noqa: PLC0415 - as above
 
+        for_s = None if for_ is None else duration_s(for_)
+        check_said(self.reason, for_s)
         return OrderView(
             door=self.door(),
             is_json=self.json_,
@@ -160,11 +161,11 @@ class Consents(Answers):
             is_plan=self.plan,
             reason=self.reason,
             revision=self.revision,
-            for_s=None if for_ is None else duration_s(for_),
+            for_s=for_s,
             accepted=tuple(self.accept or ()),
             words=words,
-            is_data=is_data,
             pause_after=pause_after,
+            **more,
         )
 
 
@@ -225,7 +226,7 @@ class Machine(Here):
 class _Spread:
     """A verb as typer sees it: where its first parameter is a set of options, each of these is one of its own."""
 
-    def __init__(self, verb: Callable[..., None]) -> None:
+    def __init__(self, verb: Callable[..., int | None]) -> None:
         functools.update_wrapper(self, verb)
         self._verb = verb
         self._set: tuple[str, type[Options]] | None = None
@@ -243,21 +244,27 @@ class _Spread:
         return whole.replace(parameters=[*others, *kind.parameters().values()])
 
     def __call__(self, **given: Any) -> None:
-        """Run it."""
+        """Run it; the code that it returns is the exit code."""
         if self._set is not None:
             name, kind = self._set
             given[name] = kind({option: given.pop(option) for option in kind.parameters()})
-        self._verb(**given)
+        raise typer.Exit(self._verb(**given) or EXIT_OK)
 
 
-def add_verb(app: typer.Typer, verb: Callable[..., None], name: str | None = None, *, is_hidden: bool = False) -> None:
-    """Make a function a verb of ``app``."""
-    app.command(name, cls=Verb, hidden=is_hidden)(_Spread(verb))
+def command_of(name: str, verb: Callable[..., int | None] | typer.Typer) -> Any:
+    """A function or a group as a command of that name."""
+    if isinstance(verb, typer.Typer):
+        return typer.main.get_command(verb)
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app.command(name, cls=Verb)(_Spread(verb))
+    return typer.main.get_command(app)
 
 
-def new_group(name: str, about: str, verbs: dict[str, Callable[..., None]]) -> typer.Typer:
+def new_group(name: str, about: str, verbs: dict[str, Callable[..., int | None]]) -> typer.Typer:
     """A verb with verbs below it, by their names; ``about``: what its help says."""
-    group = typer.Typer(name=name, cls=Verbs, help=about, no_args_is_help=True, rich_markup_mode=None)
+    group = typer.Typer(
+        name=name, cls=Verbs, help=about, no_args_is_help=True, add_completion=False, rich_markup_mode=None
+    )
     for below, verb in verbs.items():
-        add_verb(group, verb, below)
+        group.command(below, cls=Verb)(_Spread(verb))
     return group

@@ -10,7 +10,9 @@ import textwrap
 import time
 from typing import Any, Final, TypeAlias
 
+from zsched.commands.common import CliError
 from zsched.core.values.words import missed
+from zsched.exits import EXIT_USAGE
 
 STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
 
@@ -121,6 +123,31 @@ def short_span(seconds: float | None) -> str:
     """
     told = span(seconds)
     return told if len(told) <= 5 else re.split(r"(?<=[dhm])", told)[0]
+
+
+_DURATION = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,9})?)(s|m|h|d)")
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def duration_s(text: str) -> float:
+    """Seconds of a duration like ``90s``, ``10m``, ``2h``, ``1d``.
+
+    >>> duration_s("10m")
+    600.0
+
+    Raises:
+        CliError: it is none.
+    """
+    seconds = age_s_of(text)
+    if seconds is None:
+        raise CliError(EXIT_USAGE, f"{text!r} is no duration; write it like 90s, 10m, 2h or 1d")
+    return seconds
+
+
+def age_s_of(text: str) -> float | None:
+    """Seconds of a duration; ``None``: it is none."""
+    found = _DURATION.fullmatch(text)
+    return None if found is None else float(found[1]) * _UNITS[found[2]]
 
 
 def clock_time(then: float, now: float) -> str:

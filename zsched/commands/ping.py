@@ -11,13 +11,18 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched import paths as places
-from zsched.adapters.network.node_ping import LARGE_S, SIZES, Pinged, ping
+from zsched.adapters.network.node_ping import LARGE_S, SIZES, Pinged
+from zsched.adapters.network.node_ping import ping as measure
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, fleet_here, name_here
 from zsched.commands.common import CliError, Json, nearest, print_json, say
+from zsched.commands.here import own_name
+from zsched.commands.options import JsonOption, NameOption, RuntimeOption
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.snapshot import Snapshot
@@ -51,18 +56,25 @@ class Way(Struct, frozen=True, kw_only=True):
     found: Pinged
 
 
-def ping_node(
-    question: Question, me: str | None, config: Path | None, runtime_dir: Path | None, *, is_json: bool
+def ping(
+    whom: Annotated[str, typer.Argument(metavar="NODE", help="A node of the fleet file.")],
+    count: Annotated[int, typer.Option("--count", "-c", min=1, max=10_000, metavar="N", help="Questions.")] = 4,
+    timeout: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="S", help="Seconds for an answer.")] = 1.0,
+    interval: Annotated[float, typer.Option(min=0.0, max=60.0, metavar="S", help="Seconds between two.")] = 0.2,
+    json_: JsonOption = False,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="Fleet file. [ZSCHED_CONFIG, else as for up]")
+    ] = None,
+    node: NameOption = None,
+    runtime_dir: RuntimeOption = None,
 ) -> int:
-    """Measure every way there is, print it, and return the exit code.
+    """Measure how long a node's control and data sessions take to answer, and by which address.
 
-    ``me``: what this machine is called; ``None``: as the environment, the host name or the only daemon here says.
-
-    Raises:
-        CliError: there is no such node, or no way to it; or several daemons run here, and nothing says which asks.
-        ConfigError: no document is agreed, and the fleet file cannot be used.
+    Exits with 3 when the node answers by no way, with 1 when by some only.
     """
-    me = name_here(me, runtime_dir)
+    own_name(node)
+    question = Question(node=whom, count=count, timeout_s=timeout, interval_s=interval)
+    me = name_here(node, runtime_dir)
     socket = places.socket_path(places.asked_folder(runtime_dir, os.environ), me)
     here = _own_status(socket)
     fleet = fleet_here(None if here is None else Door(socket=socket), places.config_path(config, os.environ))
@@ -76,7 +88,7 @@ def ping_node(
         text = f"{question.node} has no address in the fleet file, and no daemon runs here that could ask it"
         raise CliError(EXIT_UNREACHABLE, f"{text}; run this on a node of the fleet, or give it `host:` and `listen:`")
     body = _as_json(question, ways, _hearing(question.node, me, ways, here))
-    if is_json:
+    if json_:
         print_json(body)
     else:
         for line in _lines(question.node, ways, body["heard"]):
@@ -102,7 +114,7 @@ def _ways(fleet: Fleet, me: NodeId, question: Question) -> Iterator[Way]:
 
     def measured(one: tuple[str, str, str], config: str) -> Way:
         name, endpoint, large = one
-        found = ping(
+        found = measure(
             config,
             selectors[name],
             count=1 if large else question.count,
@@ -197,3 +209,6 @@ def _lines(node: NodeId, ways: list[Way], heard: Json) -> Iterator[str]:
     for listener, speakers in heard.items():
         for speaker, state in speakers.items():
             yield f"{listener} finds {speaker} {state}"
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

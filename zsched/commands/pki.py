@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -31,6 +31,7 @@ from zsched.commands.common import (
     say,
     warn,
 )
+from zsched.commands.options import AskedOption, ConfigOption, JsonOption, Options, RuntimeOption, new_group
 from zsched.commands.renewing import holds_authority, renew_advice
 from zsched.config.load import load_fleet
 from zsched.core.values.certificates import Holder, Role, parse_common_name, parse_label
@@ -58,11 +59,29 @@ DANGERS: Final = (SECOND,)
 DUE, REVOKED, ENDED, VALID = "due", "revoked", "ended", "valid"
 
 
-class Where(Struct, frozen=True, kw_only=True):
-    """The fleet file and the authority's folder, as they were given."""
+AuthorityOption = Annotated[
+    Path | None,
+    typer.Option("--authority", metavar="DIR", help="Its folder. [ZSCHED_AUTHORITY, else below ~/.local/share/zsched]"),
+]
 
-    config: Path | None
-    authority: Path | None
+
+RequestOption = Annotated[
+    Path | None,
+    typer.Option("--csr", metavar="FILE", help="A certificate request: the key stays where it was made."),
+]
+
+
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", metavar="DIR", help="Where the files go. [./NAME]")]
+
+
+LabelArgument = Annotated[str, typer.Argument(metavar="NAME", help="As `zsched pki show` names it: robot1, robot1.k2.")]
+
+
+class Where(Options):
+    """Which authority is meant, and of which fleet."""
+
+    config: ConfigOption = None
+    authority: AuthorityOption = None
 
 
 class _Office(Struct, frozen=True, kw_only=True):
@@ -72,22 +91,30 @@ class _Office(Struct, frozen=True, kw_only=True):
     folder: Path
 
 
-def init(where: Where, *, asks_passphrase: bool, accepted: Sequence[str] = ()) -> int:
-    """Make the authority of the fleet in the fleet file; ``accepted``: names of dangers.
+def init(
+    where: Where,
+    passphrase: Annotated[
+        bool, typer.Option("--passphrase", help="Lock its key. [ZSCHED_AUTHORITY_PASSPHRASE, else it asks]")
+    ] = False,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option("--accept", metavar="DANGER", help="second-authority: the fleet's own is lost for good."),
+    ] = None,
+) -> int:
+    """Make the fleet's authority: a key that signs certificates, on this machine only.
 
-    Raises:
-        CliError: this machine trusts another one, and the danger is not accepted.
-        AdapterError: there is an authority already, or the folder cannot be written.
+    Refused where this machine trusts an authority already: that one is on another machine, and signs for the fleet.
     """
     from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
 
-    check_dangers(accepted, DANGERS)
+    check_dangers(accept or (), DANGERS)
     office = _office(where)
-    if (trusted := _trusted_here(office.fleet)) and SECOND not in accepted and not places.has_authority(office.folder):
+    is_taken = SECOND in (accept or ())
+    if (trusted := _trusted_here(office.fleet)) and not is_taken and not places.has_authority(office.folder):
         advice = f"if that is lost for good (docs/guide/secure.md): --accept {SECOND}"
         said = f"a second authority makes certificates by which nobody is let in; {advice}"
         raise CliError(EXIT_FAILED, f"{_elsewhere(office.fleet, trusted)}; {said}")
-    secret = _new_passphrase() if asks_passphrase else os.environ.get(PASSPHRASE, "").encode()
+    secret = _new_passphrase() if passphrase else os.environ.get(PASSPHRASE, "").encode()
     authority = create(office.folder, office.fleet.name, secret, _now())
     lock = "locked with the passphrase" if secret else "not locked: --passphrase does that"
     first = office.fleet.nodes[0].name
@@ -104,20 +131,25 @@ def init(where: Where, *, asks_passphrase: bool, accepted: Sequence[str] = ()) -
     return EXIT_OK
 
 
-def issue(where: Where, name: str, role: Role, request: Path | None, out: Path | None) -> int:
-    """Make the first certificate of a node, an operator or a guest.
+def issue(
+    where: Where,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A node of the fleet file, or a person or tool.")],
+    role: Annotated[Role, typer.Option("--role", help="What NAME is.")] = Role.NODE,
+    csr: RequestOption = None,
+    out: OutOption = None,
+) -> int:
+    """Make the key and the first certificate of a node, an operator or a guest; it lasts 30 days.
 
-    Raises:
-        CliError: the fleet file knows no such node, or a node of that name; or this machine trusts another authority.
-        AdapterError: the holder has a certificate already, or a file is not usable.
+    Nodes may do what zsched does. An operator may also give commands from a machine that is no node. A guest reads
+    status and streams.
     """
     with _opened(where) as (office, authority):
         check_trusted(office.fleet, authority)
         hosts = _check_name(office.fleet, name, role)
-        asked, now = _request(request), _now()
+        asked, now = _request(csr), _now()
         holder = authority.next_holder(name, role, asked, now)
         folder = out or Path(holder.label)
-        _check_free(folder, office.fleet.name, holder, makes_key=request is None)
+        _check_free(folder, office.fleet.name, holder, makes_key=csr is None)
         issued = authority.issue(name, role, hosts, asked, _passphrase(authority), now)
         _write(folder, issued)
     files = f"{CERTIFICATE}, {TRUSTED}" + (f", {KEY}" if issued.key else "")
@@ -264,27 +296,39 @@ def issue_for(fleet: Fleet, node: str, given: Path | None, secret: bytes, reques
         return authority.issue(node, Role.NODE, hosts, request, secret, _now())
 
 
-def renew(where: Where, label: str | None, request: Path | None, out: Path | None) -> int:
-    """Make a new certificate for the key of one label, or (``None``) for every key whose certificate is due.
+def renew(
+    where: Where,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one. [all that are due]")] = None,
+    csr: RequestOption = None,
+    out: OutOption = None,
+    deliver: Annotated[
+        bool, typer.Option("--deliver", help="Send each node its newest one, through the daemon here; no files.")
+    ] = False,
+    node: AskedOption = None,
+    runtime_dir: RuntimeOption = None,
+) -> int:
+    """Make new certificates for keys that have one. A certificate is due after two thirds of its life.
 
-    Raises:
-        CliError: --csr or --out without a name.
-        AdapterError: there is no such key, it is revoked, or a file is not usable.
+    With --deliver the nodes take them by themselves; the timer zsched-renew does that every day.
     """
-    if label is None and (request is not None or out is not None):
+    if deliver:
+        if csr is not None or out is not None:
+            raise CliError(EXIT_USAGE, "--csr and --out go without --deliver")
+        return _deliver(where, find_door(runtime_dir, node), name)
+    if name is None and (csr is not None or out is not None):
         raise CliError(EXIT_USAGE, "--csr and --out go with a NAME")
     with _opened(where) as (office, authority):
         secret = _passphrase(authority)
         now = int(_now().timestamp())
         live = [one for one in authority.record.entries if one.revoked is None]
-        labels = [one.label for one in live if one.is_due(now, authority.record.number)] if label is None else [label]
+        labels = [one.label for one in live if one.is_due(now, authority.record.number)] if name is None else [name]
         hosts = {node.name: (node.host,) if node.host else () for node in office.fleet.nodes}
         for one in labels:
             holder, folder = parse_label(one), out or Path(one)
             if holder is not None:
                 _check_free(folder, office.fleet.name, holder, makes_key=False)
             named = hosts.get(holder.name) if holder is not None and holder.role is Role.NODE else None
-            issued = authority.renew(one, named, _request(request), secret, _now())
+            issued = authority.renew(one, named, _request(csr), secret, _now())
             _write(folder, issued)
             _say(f"{folder}: {CERTIFICATE}, {TRUSTED} of {one}, until {_day(issued.entry)}")
     if labels:
@@ -294,7 +338,7 @@ def renew(where: Where, label: str | None, request: Path | None, out: Path | Non
     return EXIT_OK
 
 
-def deliver(where: Where, door: Door, label: str | None) -> int:
+def _deliver(where: Where, door: Door, label: str | None) -> int:
     """Renew what is due, or one label, and send every node its newest certificate; the exit code.
 
     A node that was away gets it the next time. What the fleet has no node for is named, and not renewed.
@@ -386,11 +430,14 @@ def _send(door: Door, entry: Entry) -> str:
     return str(answer["outcome"])
 
 
-def show(where: Where, *, is_json: bool) -> int:
-    """Tell of the authority and of every key that it has certified."""
+def show(
+    where: Where,
+    json_: JsonOption = False,
+) -> int:
+    """List every key that was certified: until when, and whether it is due, revoked or ended."""
     with _opened(where) as (office, authority):
         body = _as_json(office, authority)
-    if is_json:
+    if json_:
         print_json(body)
         return EXIT_OK
     lines = [
@@ -407,19 +454,15 @@ def show(where: Where, *, is_json: bool) -> int:
     return EXIT_OK
 
 
-def revoke(where: Where, label: str) -> int:
-    """Mark a key as revoked, and say what takes effect.
-
-    Raises:
-        AdapterError: there is no such key.
-    """
+def revoke(where: Where, name: LabelArgument) -> int:
+    """Never certify a key again, and say which line of the fleet file keeps it out."""
     with _opened(where) as (office, authority):
-        entry = authority.revoke(label, _now())
+        entry = authority.revoke(name, _now())
         security = office.fleet.security
-        revoked = sorted({*(security.revoked if security else ()), label})
+        revoked = sorted({*(security.revoked if security else ()), name})
     name, role = entry.holder.name, entry.holder.role
     _say(
-        f"{label} is revoked: its key is never certified again",
+        f"{name} is revoked: its key is never certified again",
         f"it is let in until every node goes by a fleet file with `security: {{revoked: [{', '.join(revoked)}]}}`, "
         "or without the name: zsched edit (or the file everywhere, and systemctl reload); daemons begin anew in turn",
         f"`zsched pki issue {name}{'' if role is Role.NODE else f' --role {role}'}` makes a new key for the name",
@@ -427,16 +470,13 @@ def revoke(where: Where, label: str) -> int:
     return EXIT_OK
 
 
-def rotate(where: Where, *, is_end: bool) -> int:
-    """Begin with a new authority, or (``is_end``) stop trusting the former one.
-
-    Raises:
-        AdapterError: a rotation is under way, or there is none.
-        CliError: certificates of the former authority are left, nodes do not have theirs of the new one, or the daemon
-            here does not answer.
-    """
+def rotate(
+    where: Where,
+    finish: Annotated[bool, typer.Option("--finish", help="Stop trusting the former authority.")] = False,
+) -> int:
+    """Begin with a new authority. Both are trusted until --finish, which waits for every certificate to be renewed."""
     with _opened(where) as (_, authority):
-        if not is_end:
+        if not finish:
             authority.rotate(_passphrase(authority), _now(), _lives(authority.record.fleet))
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
@@ -756,3 +796,10 @@ def _now() -> datetime:
 def _say(*lines: str) -> None:
     if shown := [line for line in lines if line]:
         say("\n".join(shown))
+
+
+pki = new_group(
+    "pki",
+    "The fleet's authority and its certificates.",
+    {"init": init, "issue": issue, "show": show, "renew": renew, "revoke": revoke, "rotate": rotate},
+)

@@ -1,16 +1,23 @@
 """The program's verbs: its own, and those that other installed distributions bring.
 
-Knows: the entry point group `zsched.commands`, whose names are verbs and whose values are typer apps. Does not know:
-any verb. What is installed is looked at only when a verb is not the program's own, or for the help: `status` is quick.
+A verb is a function with its options, and its module is imported when the verb is named, or for the help: `status` must
+answer within 200 ms. For the same reason, what is installed is looked at only when a verb is not the program's own.
+
+Knows: in which module a verb is, the entry point group `zsched.commands`, whose names are verbs and whose values are
+typer apps. Does not know: any verb.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
 from zsched.commands.common import CliError, Verb, Verbs
+from zsched.commands.options import command_of
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -18,6 +25,46 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP: Final = "zsched.commands"
+VERBS: Final = {
+    "up": "up",
+    "init": "init",
+    "new": "example",
+    "dev": "dev",
+    "status": "status",
+    "top": "watch.screen",
+    "web": "watch.web",
+    "record": "watch.record",
+    "trace": "watch.trace",
+    "explain": "explain",
+    "history": "history",
+    "events": "history",
+    "move": "move",
+    **dict.fromkeys(("pin", "unpin", "pause", "resume"), "hold"),
+    "tune": "tune",
+    "restart": "restart",
+    **dict.fromkeys(("drain", "undrain"), "flags"),
+    **dict.fromkeys(("invite", "join"), "membership"),
+    "leave": "leave",
+    "rehearse": "rehearse",
+    "doctor": "doctor",
+    "ping": "ping",
+    "bugreport": "bugreport",
+    "wait": "wait",
+    "logs": "logs",
+    "check": "check",
+    "apply": "apply",
+    "edit": "fleet",
+    "version": "versions",
+    **dict.fromkeys(("install", "uninstall"), "install"),
+    "stream": "stream",
+    "fleet": "fleet",
+    **dict.fromkeys(("task", "node"), "entries"),
+    "pki": "pki",
+    "metrics": "metrics",
+}
+"""{verb: the module of `zsched.commands` that has a function, or a group, of its name}, in the order of the help."""
+UNTOLD: Final = {"complete": "completion"}
+"""The same, of those that the help leaves out."""
 LAB_VERBS: Final = frozenset({"bench", "demo"})
 """Verbs of the distribution ``zsched-lab``, which a robot has not."""
 INSTEAD: Final = {
@@ -52,8 +99,33 @@ def installed_verbs() -> dict[str, EntryPoint]:
     return dict(sorted(found.items()))
 
 
+@cache
+def _own(name: str) -> Any:
+    module = import_module(f"zsched.commands.{(VERBS | UNTOLD)[name]}")
+    return command_of(name, getattr(module, name))
+
+
+class OwnVerbs(Mapping[str, Any]):
+    """{name: command} of the program's own verbs; each is made when it is looked up."""
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in VERBS and name not in UNTOLD:
+            raise KeyError(name)
+        return _own(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(VERBS)
+
+    def __len__(self) -> int:
+        return len(VERBS)
+
+
 class Program(Verbs):
     """The group of all verbs."""
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**given)
+        self.commands: Any = OwnVerbs()
 
     def list_commands(self, ctx: Any) -> list[str]:
         """All verbs, for the help."""

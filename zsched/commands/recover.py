@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
+import typer
+
+from zsched.commands.change import user_name
 from zsched.commands.common import CliError, check_dangers, check_taken, confirm, say, warn
-from zsched.commands.init import Place
-from zsched.commands.orders import user_name
+from zsched.commands.init import Place, create_state, place_of
+from zsched.commands.options import AcceptOption, Here, PlanOption, YesOption
 from zsched.core.electorate.recovery import Danger, Recovery, consider
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import SAID_DIGITS, FleetValue
 from zsched.core.values.model import RegisterState
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import MAX_ASKER, shown
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.runtime import recovery as runtime
 
 DANGERS = tuple(danger.value for danger in Danger)
@@ -32,7 +36,7 @@ class Manner(Struct, frozen=True, kw_only=True):
     accepted: tuple[str, ...] = ()
 
 
-def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
+def begin_generation(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
     """Make this node the only elector of a new generation; the exit code.
 
     Raises:
@@ -62,7 +66,7 @@ def recover(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
     return EXIT_OK
 
 
-def rejoin(place: Place, manner: Manner, wanted: str) -> int:
+def rejoin_side(place: Place, manner: Manner, wanted: str) -> int:
     """Let this node change sides to another generation; the exit code.
 
     Raises:
@@ -152,3 +156,52 @@ def _next(plan: Recovery, value: FleetValue) -> str:
             "`electorate: auto` in it lets them be added by themselves"
         )
     return "\n".join(lines)
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def recover_fleet(
+    here: Here,
+    wanted: Annotated[
+        str, typer.Argument(metavar="[GENERATION]", help="With --rejoin: how its id begins, where there are several.")
+    ] = "",
+    brought: Annotated[
+        list[Path] | None,
+        typer.Option("--from", metavar="STATE_FILE", help="State of a dead machine's disk; give it once for each."),
+    ] = None,
+    rejoin: Annotated[
+        bool, typer.Option("--rejoin", help="Change sides to another generation, and start blank.")
+    ] = False,
+    generation: Annotated[
+        int, typer.Option("--generation", metavar="G", min=0, help="No state is left to go on with: start anew as G.")
+    ] = 0,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --generation: although nobody says that it is needed.")
+    ] = False,
+    settle: Annotated[
+        bool, typer.Option("--settle", help="The other machine of this name is gone: be an elector again.")
+    ] = False,
+    plan: PlanOption = False,
+    yes: YesOption = False,
+    accept: AcceptOption = None,
+) -> int:
+    """Begin a new generation on one survivor when a majority of the electors is lost for good.
+
+    Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
+    refused while a majority of the electors can agree.
+
+    With --rejoin the daemon of another node, stopped too, is brought over: what that one has promised and learnt in its
+    own generation is dropped. With --generation, on every node, all daemons stopped, the fleet starts anew with the G
+    that `zsched status` names; refused while it agrees, and where a good state would be lost.
+    """
+    is_anew, accepted = bool(generation or settle or force), tuple(accept or ())
+    if rejoin + settle + (generation > 0) > 1 or (plan and is_anew):
+        raise CliError(EXIT_USAGE, "give one of --rejoin, --generation G and --settle; the last two go without --plan")
+    if (wanted and not rejoin) or (brought and (rejoin or is_anew)):
+        raise CliError(EXIT_USAGE, "a GENERATION goes with --rejoin, and --from with neither it nor --generation")
+    place, manner = place_of(here), Manner(is_plan=plan, is_sure=yes, accepted=accepted)
+    if is_anew:
+        create_state(place, generation, is_forced=force, is_settling=settle, accepted=accepted)
+        return EXIT_OK
+    return rejoin_side(place, manner, wanted) if rejoin else begin_generation(place, manner, tuple(brought or ()))

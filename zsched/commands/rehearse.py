@@ -13,15 +13,18 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Annotated, Final, TypeVar
+
+import typer
 
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
+from zsched.commands.change import OrderView, Plan, Row, asker, consent
 from zsched.commands.common import CliError, Json, ends_as_by_ctrl_c, nearest, print_json, say, told_task, warn
 from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
-from zsched.commands.orders import OrderView, Row, asker, begin, check_can_ask
+from zsched.commands.options import Orders
 from zsched.commands.page import counted
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
@@ -120,7 +123,7 @@ def show_kept(door: Door, name: str | None, *, is_json: bool) -> int:
 # --- one rehearsal ---------------------------------------------------------------------------------------------------
 
 
-def rehearse(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
+def play(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
     """Show the programme, ask, play it, tell what came, and bring the task back; returns the exit code.
 
     Raises:
@@ -147,9 +150,8 @@ def rehearse(view: OrderView, order: RehearseOrder, runtime: Path) -> int:
     plan["plan"] = [{"step": step.value, "left_out": why or None} for step, why in planned.items()]
     if not doable and not view.is_plan:
         told = f"{order.task}: no step can be done: " + "; ".join(f"{step}: {why}" for step, why in planned.items())
-        check_can_ask(view, f"{told}\n")
         raise CliError(EXIT_FAILED, f"{told}; nothing was done")
-    code = begin(view, rows, plan, is_change=bool(doable), warning=warning)
+    code = consent(view, Plan(rows=rows, body=plan, is_change=bool(doable), warning=warning))
     if code is not None:
         return code
     stage.refused = {step: why for step, why in planned.items() if why}
@@ -601,3 +603,38 @@ def _sights(tasks: Mapping[str, Json]) -> list[Sight]:
         for robot, task in tasks.items()
         for stream in task["streams"]
     ]
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def rehearse(
+    said: Orders,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task of the fleet file.")] = None,
+    steps: Annotated[
+        str, typer.Option(metavar="STEPS", help="What is done, in this order: move, drain, worker, daemon, link.")
+    ] = "move,drain,worker,daemon,link",
+    rounds: Annotated[int, typer.Option(min=1, max=100, metavar="N", help="How often all of it.")] = 1,
+    pause: Annotated[float, typer.Option(metavar="S", help="Seconds of calm before each step; at least 11.")] = 12.0,
+    limit: Annotated[
+        float, typer.Option(min=5.0, max=3600.0, metavar="S", help="Seconds that recovering may take.")
+    ] = 60.0,
+    cut: Annotated[
+        float | None, typer.Option(metavar="S", help="Seconds of a cut. [until the task has moved, and 2 more]")
+    ] = None,
+    kept: Annotated[bool, typer.Option("--list", help="List the rehearsals that the node has kept.")] = False,
+    show: Annotated[str | None, typer.Option(metavar="ID", help="Show one of them.")] = None,
+) -> int:
+    """Play faults on the running fleet, one at a time, and tell what it makes of them beside what is promised.
+
+    It asks first, needs a second fit candidate, waits for calm before each step, and stops at the first broken promise.
+    Exits with 1 when one was broken, with 5 when it could not go on.
+    """
+    if kept or show is not None:
+        if task is not None:
+            raise CliError(EXIT_USAGE, "--list and --show go without a task")
+        return show_kept(said.door(), show, is_json=said.json_)
+    if task is None:
+        raise CliError(EXIT_USAGE, "name a task, or --list: `zsched rehearse TASK`")
+    order = RehearseOrder(task=task, steps=parse_steps(steps), rounds=rounds, pause_s=pause, limit_s=limit, cut_s=cut)
+    return play(said.order(), order, places.asked_folder(said.runtime_dir, os.environ))

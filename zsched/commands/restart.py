@@ -1,43 +1,54 @@
-"""`zsched restart`: has one worker stopped and started again, before and after first.
+"""`zsched restart`: has one worker stopped and started again.
 
-Knows: which node is meant, outcomes as exit codes. Does not know: how a worker is stopped.
+Knows: which node is meant. Does not know: how a worker is stopped.
 """
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import typer
+
 from zsched.commands.ask import ask_door
-from zsched.commands.common import CliError, print_json, say
-from zsched.commands.document import CODES
+from zsched.commands.change import Plan, consent
+from zsched.commands.common import CliError, Json, print_json, say, told_task
+from zsched.commands.document import CODES, status_of
 from zsched.commands.logs import worker_node
-from zsched.commands.orders import OrderView, begin, check_said
+from zsched.commands.options import Consents, TaskArgument
 from zsched.exits import EXIT_FAILED
 
 SCHEMA = "zsched.restart/1"
 
 
-def restart(view: OrderView, task: str, whose: str | None) -> int:
-    """Ask the node to start its worker again; prints what it answers and returns the exit code.
+def restart(
+    said: Consents,
+    task: TaskArgument,
+    whose: Annotated[str | None, typer.Argument(metavar="[NODE]", help="Whose worker; without it the owner's.")] = None,
+) -> int:
+    """Stop a task's worker and start it again, also one that has failed for good; that counts as no failure.
 
-    Raises:
-        CliError: nobody answers, there is no such task or node (2), it was not agreed to (1, or 2 off a terminal), the
-            node refuses (1), or does not tell what has become of it (5).
+    The task pauses meanwhile if it is the owner's.
     """
-    check_said(view)
-    status = ask_door(view.door, {"verb": "status"})
+    view = said.order()
+    status = status_of(view.door)
     node = worker_node(status, task, whose)
-    owner = next(known["owner"] for known in status["tasks"] if known["name"] == task)
-    after = "started again; the task pauses until it is ready" if node == owner else "started again"
-    workers = next(one["workers"] for one in status["nodes"] if one["name"] == node)
+    is_owner = told_task(status, task)["owner"] == node
+    after = f"started again{'; the task pauses until it is ready' if is_owner else ''}"
+    workers = [worker for one in status["nodes"] if one["name"] == node for worker in one["workers"]]
     state = next((str(worker["state"]) for worker in workers if worker["task"] == task), "-")
+
+    def body(outcome: str, detail: str) -> Json:
+        return {"schema": SCHEMA, "task": task, "node": node, "outcome": outcome, "detail": detail}
+
     rows = [(task, f"worker on {node}", state, after)]
-    plan = {"schema": SCHEMA, "task": task, "node": node, "outcome": "planned", "detail": after}
-    code = begin(view, rows, plan, is_change=True, warning=f"{node} owns {task}." if node == owner else "")
+    plan = Plan(rows=rows, body=body("planned", after), warning=f"{node} owns {task}." if is_owner else "")
+    code = consent(view, plan)
     if code is not None:
         return code
     answer = ask_door(view.door.to(node), {"verb": "restart", "task": task, **view.asked})
     outcome, detail = str(answer["outcome"]), str(answer["detail"])
     if view.is_json:
-        print_json({"schema": SCHEMA, "task": task, "node": node, "outcome": outcome, "detail": detail})
+        print_json(body(outcome, detail))
     elif outcome == "ok":
         say(f"{task} on {node}: {detail}")
     else:

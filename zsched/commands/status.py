@@ -8,13 +8,17 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from typing import Annotated
+
+import typer
 
 from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, wants_color, warn
+from zsched.commands.options import Answers, NoColorOption
 from zsched.commands.report import TROUBLES, degradations, render_status
 from zsched.core.values.struct import Struct
-from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK
+from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.screen import CUT_LINES, WRAP_LINES, drawn, fitted
 
 MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
@@ -143,3 +147,30 @@ def code_of(status: Json) -> int:
 
 def _width() -> int:
     return max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def status(
+    asked: Answers,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
+    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    site: Annotated[bool, typer.Option("--site", help="A line for each fleet of the site, with --json only.")] = False,
+    no_color: NoColorOption = False,
+) -> int:
+    """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
+
+    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner. With --site it asks the fleets
+    under `site:` in the document, or in the fleet file, and one that does not answer is degraded, too.
+    """
+    if site:
+        from zsched.commands.cells import of_site, show_site  # noqa: PLC0415 - each verb imports what it needs
+
+        if verbose or watch:
+            raise CliError(EXIT_USAGE, "--site shows a line for each fleet; leave out -v and --watch")
+        return show_site(*of_site(asked), is_json=asked.json_)
+
+    view = StatusView(door=asked.door(), is_json=asked.json_, is_plain=no_color, is_whole=verbose)
+    return watch_on(view, interval) if watch else show(view)

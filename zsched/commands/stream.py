@@ -5,14 +5,18 @@ Knows: how a word becomes keys, windows, tables and JSON lines. Does not know: z
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.options import Answers, AskedOption, JsonOption, Local, new_group
 from zsched.commands.page import Page, counted, since_drop, size, span
 from zsched.core.route import keyexpr
 from zsched.core.values.struct import Struct, field
@@ -357,3 +361,73 @@ def _tap(view: StreamView, word: str | None, kept_bytes: int = 0) -> StreamTap:
 
 def _asked(door: Door) -> Json:
     return {} if door.node is None else {"node": door.node}
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+KeyArgument = Annotated[
+    str | None,
+    typer.Argument(metavar="[KEY]", help="A stream (map_merge/in/0, in/0) or a key expression. [the robot's own keys]"),
+]
+
+
+WindowOption = Annotated[float, typer.Option("--window", min=0.1, max=3600.0, metavar="S", help="Seconds to look at.")]
+
+
+CountOption = Annotated[
+    int | None, typer.Option("--count", min=1, metavar="N", help="End after N of them. [go on until Ctrl-C]")
+]
+
+
+class Tap(Local):
+    """Where samples are listened to, how many, and how they are shown."""
+
+    json_: JsonOption = False
+    count: CountOption = None
+    node: AskedOption = None
+
+    def run(self, verb: str, key: str | None, window: float = 1.0, timeout: float | None = None) -> int:
+        """Until there were enough, or Ctrl-C: that is how these verbs are meant to end."""
+        door, code = self.door(), 0
+        view = StreamView(door=door, is_json=self.json_, window_s=window, count=self.count, timeout_s=timeout)
+        with contextlib.suppress(KeyboardInterrupt):
+            code = show_tail(view, key) if verb == "tail" else show_rates(view, key, verb)
+        return code
+
+
+def list_(asked: Answers, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
+    """List a node's streams: from where to where, how fast, and what was dropped."""
+    return show_list(StreamView(door=asked.door(), is_json=asked.json_, window_s=window), key)
+
+
+def hz(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
+    """Show how often something comes on each key, and the shortest and longest gap.
+
+    Of a stream, both its ends are shown. Exits with 1 when nothing came in the last window.
+    """
+    return tap.run("hz", key, window)
+
+
+def bw(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
+    """Show how many bytes per second come on each key, and the smallest and largest message."""
+    return tap.run("bw", key, window)
+
+
+def tail(
+    tap: Tap,
+    key: KeyArgument = None,
+    timeout: Annotated[
+        float | None, typer.Option("--timeout", min=0.1, metavar="S", help="End after S seconds. [go on until Ctrl-C]")
+    ] = None,
+) -> int:
+    """Print every message as it comes: key, size, encoding, the first bytes.
+
+    Exits with 1 when nothing came within the timeout.
+    """
+    return tap.run("tail", key, timeout=timeout)
+
+
+stream = new_group(
+    "stream", "What flows where right now, for any node.", {"list": list_, "hz": hz, "bw": bw, "tail": tail}
+)

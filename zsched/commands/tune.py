@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+import typer
 
 from zsched.commands.ask import ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.change import OrderView, Plan, consent, tell_results
+from zsched.commands.common import CliError, Json, check_known, nearest, print_json, say, warn
 from zsched.commands.document import CODES, status_of
-from zsched.commands.orders import OrderView, begin, check_name, check_said, tell_results
+from zsched.commands.options import Orders
 from zsched.commands.weight_words import NAMES, shares
 from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
@@ -76,42 +79,49 @@ def _setting(pair: str, key: str, text: str) -> Any:
         raise CliError(EXIT_USAGE, f"{pair!r}: {text!r} is not {kind}") from None
 
 
-def tune(view: OrderView, name: str | None, pairs: Sequence[str]) -> int:
-    """Show tunings, or change one on the whole running fleet; returns the exit code.
+def tune(
+    said: Orders,
+    task: Annotated[str | None, typer.Argument(metavar="[TASK]", help="A task; without it: show all.")] = None,
+    pairs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[KEY=VALUE]...",
+            help="Weights (of gauges, too), all of scheduling (deadline_ms, not objective) and link, as bonus=0.2; "
+            "null: the file's.",
+        ),
+    ] = None,
+) -> int:
+    """Show a task's tuning, or change it on the whole running fleet.
 
-    Raises:
-        CliError: nobody answers, there is no such task or setting, or the change was not agreed.
+    A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
     """
-    check_said(view)
+    view = said.order()
     status = status_of(view.door)
-    known = {str(task["name"]): task for task in status["tasks"]}
-    if name is not None:
-        check_name(status, "task", name, list(known))
-    if name is None or not pairs:
-        return _list_tunings(view, [known[name]] if name is not None else list(known.values()))
-    task = known[name]
-    after = tuned(task["tuning"], file_tuning(task), pairs)
-    tuning = _checked(after, file_tuning(task))
-    flat_before, flat_after = _flat(task["tuning"]), _flat(after)
-    rows = [
-        (name, key, _figure(flat_before.get(key, 0.0)), _figure(flat_after.get(key, 0.0)))
-        for key in KEYS
-        if flat_before.get(key, 0.0) != flat_after.get(key, 0.0)
-    ]
-    if flat_after["deadline_ms"] not in (None, flat_before["deadline_ms"]) and task.get("tells_no_jobs"):
-        warn(f"{name}: {TELLS_NOTHING}")
-    told = {"task": name, "revision": task["revision"], "tuning": flat_after, "file": _flat(file_tuning(task))}
-    planned = {**told, "outcome": "planned" if rows else "unchanged", "detail": ""}
-    code = begin(view, rows, {"schema": TUNING_SCHEMA, "tasks": [planned]}, is_change=bool(rows))
+    check_known(status, "task", task)
+    chosen = [one for one in status["tasks"] if task in (None, one["name"])]
+    if task is None or not pairs:
+        return _list(view, chosen)
+    (known,) = chosen
+    file = file_tuning(known)
+    after = tuned(known["tuning"], file, pairs)
+    tuning = _checked(after, file)
+    before, now = _flat(known["tuning"]), _flat(after)
+    changed = [key for key in KEYS if before.get(key, 0.0) != now.get(key, 0.0)]
+    rows = [(task, key, _figure(before.get(key, 0.0)), _figure(now.get(key, 0.0))) for key in changed]
+    if now["deadline_ms"] not in (None, before["deadline_ms"]) and known.get("tells_no_jobs"):
+        warn(f"{task}: {TELLS_NOTHING}")
+    told = _told(known, after)
+    outcome = {"outcome": "planned" if rows else "unchanged", "detail": ""}
+    code = consent(view, Plan(rows=rows, body=_body([{**told, **outcome}]), is_change=bool(rows)))
     if code is not None:
         return code
-    base = meant(view.revision, task["revision"])
-    request = {"verb": "tune", "task": name, "tuning": tuning, "base_revision": base, **view.asked}
+    base = meant(view.revision, known["revision"])
+    request = {"verb": "tune", "task": task, "tuning": tuning, "base_revision": base, **view.asked}
     result = ask_door(view.door, request)
     if view.is_json:
-        print_json({"schema": TUNING_SCHEMA, "tasks": [{**told, **result}]})
+        print_json(_body([{**told, **result}]))
         return CODES.get(str(result["outcome"]), EXIT_FAILED)
-    return tell_results({name: result})
+    return tell_results({task: result})
 
 
 def _checked(after: Json, file: Json) -> Json:
@@ -185,27 +195,28 @@ def _figure(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float | int) else str(value)
 
 
-def _list_tunings(view: OrderView, tasks: Sequence[Json]) -> int:
+def _body(tasks: list[Json]) -> Json:
+    return {"schema": TUNING_SCHEMA, "tasks": tasks}
+
+
+def _told(task: Json, tuning: Json) -> Json:
+    file = _flat(file_tuning(task))
+    return {"task": task["name"], "revision": task["revision"], "tuning": _flat(tuning), "file": file}
+
+
+def _list(view: OrderView, tasks: Sequence[Json]) -> int:
+    told = [_told(task, task["tuning"]) for task in tasks]
     if view.is_json:
-        found = [
-            {
-                "task": task["name"],
-                "revision": task["revision"],
-                "tuning": _flat(task["tuning"]),
-                "file": _flat(file_tuning(task)),
-            }
-            for task in tasks
-        ]
-        print_json({"schema": TUNING_SCHEMA, "tasks": found})
+        print_json(_body(told))
         return EXIT_OK
-    for task in tasks:
-        now, file = _flat(task["tuning"]), _flat(file_tuning(task))
+    for one in told:
+        now, file = one["tuning"], one["file"]
         words = [
             f"{key}={_figure(now.get(key, 0.0))}{_differs(now.get(key, 0.0), file.get(key, 0.0))}"
             for key in KEYS
             if key in now or key in file
         ]
-        say(f"{task['name']} (revision {shown(task['revision'])}): {' '.join(words)}")
+        say(f"{one['task']} (revision {shown(one['revision'])}): {' '.join(words)}")
     return EXIT_OK
 
 

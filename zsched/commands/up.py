@@ -8,30 +8,39 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from pathlib import Path
-from typing import Final, NoReturn
+from enum import StrEnum
+from typing import Annotated, Final, NoReturn
+
+import typer
 
 from zsched import paths as places
 from zsched.commands.here import need_file, own_name
+from zsched.commands.options import Machine
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
-def become_daemon(
-    config: Path | None, node: str | None, state_dir: Path | None, runtime_dir: Path | None, log_level: str
-) -> NoReturn:
-    """Run the daemon in this process, whose memory of the command line goes.
+class LogLevel(StrEnum):
+    """How much the daemon says on stderr."""
 
-    Raises:
-        CliError: the fleet file cannot be read, or the node's name is none.
-    """
-    file = places.config_path(config, os.environ)
+    DEBUG = "DEBUG"
+    INFO = "INFO"
+    WARNING = "WARNING"
+    ERROR = "ERROR"
+
+
+def up(
+    here: Machine,
+    log_level: Annotated[LogLevel, typer.Option("--log-level", help="What goes to stderr.")] = LogLevel.INFO,
+) -> NoReturn:
+    """Run this machine's daemon in the foreground (what systemd runs)."""
+    file = places.config_path(here.config, os.environ)
     need_file(file)
-    name = own_name(node)
-    state = places.state_folder(state_dir, os.environ)
-    runtime = places.runtime_folder(runtime_dir, os.environ)
+    name = own_name(here.node)
+    state = places.state_folder(here.state_dir, os.environ)
+    runtime = places.runtime_folder(here.runtime_dir, os.environ)
     daemon = [sys.executable, "-P", "-m", "zsched.daemon", "--config", str(file), "--node", name]
-    daemon += ["--state-dir", str(state), "--runtime-dir", str(runtime), "--log-level", log_level]
+    daemon += ["--state-dir", str(state), "--runtime-dir", str(runtime), "--log-level", log_level.value]
     sys.stdout.flush()
     sys.stderr.flush()
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # the daemon takes what comes while it loads, see there

@@ -12,6 +12,7 @@ from importlib.metadata import version as installed
 
 from zsched import __version__
 from zsched.commands.common import Json, print_json
+from zsched.commands.options import JsonOption
 from zsched.wire import codec as wire
 
 
@@ -24,10 +25,13 @@ def versions() -> Json:
     return {"zsched": __version__, "wire": wire.VERSION, "zenoh": zenoh, "python": platform.python_version()}
 
 
-def show_versions(*, is_json: bool) -> None:
-    """Print them, a line each."""
+def version(json_: JsonOption = False) -> None:
+    """Show the versions of zsched, its wire format, zenoh and Python."""
     found = versions()
-    if is_json:
+    if json_:
         print_json({"schema": "zsched.version/1", **found})
     else:
         sys.stdout.write("".join(f"{name} {text}\n" for name, text in found.items()))
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

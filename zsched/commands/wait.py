@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, told_task
+from zsched.commands.common import CliError, Json, check_known, print_json, say, told_task
+from zsched.commands.options import Answers
 from zsched.commands.page import span
 from zsched.commands.report import all_problems
 from zsched.core.values.struct import Struct
@@ -113,45 +116,51 @@ def _under_way(statuses: Mapping[str, Json], name: str, why: str) -> list[str]:
 # --- the verb --------------------------------------------------------------------------------------------------------
 
 
-class WaitView(Struct, frozen=True, kw_only=True):
-    """Which daemon to ask, for how long, and how to show the answer."""
+def wait(
+    asked: Answers,
+    condition: Annotated[
+        str,
+        typer.Option("--for", metavar="CONDITION", help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE."),
+    ],
+    timeout: Annotated[
+        float, typer.Option("--timeout", min=0.0, max=86400.0, metavar="S", help="Seconds; 0: look once.")
+    ] = 30.0,
+) -> int:
+    """Wait until a condition holds; say what is missing if it does not in time.
 
-    find: Callable[[], Door]
-    timeout_s: float
-    is_json: bool
-
-
-def wait_for(view: WaitView, text: str) -> int:
-    """Ask until the condition holds or the time is over; returns the exit code.
-
-    Raises:
-        CliError: there is no such condition, task or node (2), or at the end nobody answers (3).
+    Exits with 5 when the time is over, with 3 when nobody answers then. A daemon that is not there yet is waited for.
     """
-    condition = parse_condition(text)
+    wanted = parse_condition(condition)
     began = monotonic_s()
     while True:
-        lacks: list[str] | CliError = _look(view, condition)
+        lacks: list[str] | CliError = _look(asked.door, wanted)
         waited_s = monotonic_s() - began
-        is_over = waited_s + PAUSE_S > view.timeout_s
+        is_over = waited_s + PAUSE_S > timeout
         if lacks == [] or is_over:
             break
         time.sleep(PAUSE_S)
     if isinstance(lacks, CliError):
         raise lacks
-    _tell(view, text, lacks, waited_s)
+    if asked.json_:
+        print_json({"schema": SCHEMA, "condition": condition, "met": not lacks, "waited_s": waited_s, "missing": lacks})
+    else:
+        say(f"{condition}: {'not met' if lacks else 'met'} after {span(waited_s)}")
+        for lack in lacks:
+            say(f"  {lack}", indent=4)
     return EXIT_TIMED_OUT if lacks else EXIT_OK
 
 
-def _look(view: WaitView, condition: Condition) -> list[str] | CliError:
+def _look(find: Callable[[], Door], condition: Condition) -> list[str] | CliError:
     """What is missing now; an error when nobody answers, which may be over soon.
 
     Raises:
         CliError: there is no such task or node (2).
     """
     try:
-        door = view.find()
+        door = find()
         first = ask_door(door, {"verb": "status"})
-        _check_names(first, condition)
+        check_known(first, "task", condition.task or None)
+        check_known(first, "node", condition.node or None)
         statuses = {str(first["node"]): first}
         if condition.is_of_all:
             others = [node for node in first["nodes"] if node["kind"] == "robot" and node["state"] == "alive"]
@@ -164,21 +173,3 @@ def _look(view: WaitView, condition: Condition) -> list[str] | CliError:
             raise
         return CliError(EXIT_UNREACHABLE, str(error))
     return missing(condition, statuses)
-
-
-def _check_names(status: Json, condition: Condition) -> None:
-    for kind, wanted, known in (("task", condition.task, status["tasks"]), ("node", condition.node, status["nodes"])):
-        names = [str(one["name"]) for one in known]
-        if wanted and wanted not in names:
-            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no {kind} {wanted!r}{nearest(wanted, names)}")
-
-
-def _tell(view: WaitView, text: str, lacks: list[str], waited_s: float) -> None:
-    if view.is_json:
-        body = {"schema": SCHEMA, "condition": text, "met": not lacks, "waited_s": waited_s, "missing": lacks}
-        print_json(body)
-        return
-    word = "not met" if lacks else "met"
-    say(f"{text}: {word} after {span(waited_s)}")
-    for lack in lacks:
-        say(f"  {lack}", indent=4)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-from zsched.commands.check import show_faults
+from zsched.commands.check import check as tell_rules
 from zsched.commands.watch.feed import News
 from zsched.commands.watch.past import Past
 from zsched.commands.watch.top import Frame, render_top
@@ -208,7 +208,7 @@ def play(situation: Situation) -> tuple[list[str], tuple[Next, ...]]:
         path = Path(folder, "fleet.yaml")
         path.write_text(fleet_file(situation.tasks, situation.electors), encoding="utf-8")
         with contextlib.redirect_stdout(io.StringIO()) as check, contextlib.redirect_stderr(check):
-            show_faults(path, is_json=False, is_verbose=True)
+            tell_rules(path, verbose=True)
         fleet = check_file(path).fleet
     assert fleet is not None, check.getvalue()
     hall = Hall(fleet, dict(situation.cores))

@@ -13,9 +13,9 @@ from support.schemas import faults
 from zsched.commands import ask
 from zsched.commands.ask import ask_door, find_door
 from zsched.commands.cells import show_histories, show_site
+from zsched.commands.change import asker, user_name
 from zsched.commands.common import CliError, Json
 from zsched.commands.history import Past
-from zsched.commands.orders import asker, user_name
 from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched_lab.fleet.loopback import free_endpoint, own_address
 

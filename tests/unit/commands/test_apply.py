@@ -19,9 +19,9 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands import document, fleet
 from zsched.commands.ask import PASSES_ON
+from zsched.commands.change import OrderView
 from zsched.commands.common import CliError
 from zsched.commands.document import DOCUMENT, InForce, in_force
-from zsched.commands.orders import OrderView
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
@@ -621,7 +621,7 @@ def test_edit_keeps_what_was_typed_where_it_only_plans_or_is_broken_off(
         make(in_force(view.door))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fleet, "apply", broken_off)
+    monkeypatch.setattr(fleet, "apply_change", broken_off)
     off = run("edit")
     (kept,) = tmp_path.glob("*.yaml")
     assert (off.exit_code != 0, "{cpu: 1}" in kept.read_text()) == (True, True)

@@ -17,8 +17,8 @@ from zsched import paths as places
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.commands import ask
 from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
+from zsched.commands.change import asker, user_name
 from zsched.commands.common import CliError, Json
-from zsched.commands.orders import asker, user_name
 from zsched.core.values.fleet import Cell
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.errors import AdapterError

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,7 +23,7 @@ from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.commands import explain as verb
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.explain import SCHEMA, ExplainView, explain, formula_of
+from zsched.commands.explain import SCHEMA, explain, formula_of
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Explanation, JudgeMemory, KeptMemory, Move, Need
@@ -99,9 +100,9 @@ def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
     return made
 
 
-def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, **more: str | None) -> int:
-    view = ExplainView(plan=more.pop("plan", None), is_json=is_json, is_colored=False, **more)
-    return explain(Door(socket=Path("s"), node=node), task, view)
+def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, **more: Any) -> int:
+    said: Any = SimpleNamespace(door=lambda: Door(socket=Path("s"), node=node), json_=is_json)
+    return explain(said, task, **more)
 
 
 def test_a_daemon_that_tells_no_sums_gets_the_same_page(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:

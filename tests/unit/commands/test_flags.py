@@ -19,7 +19,7 @@ from zsched.cli import app
 from zsched.commands import flags as verbs
 from zsched.commands.ask import Door
 from zsched.commands.brief import render_brief
-from zsched.commands.orders import OrderView
+from zsched.commands.change import OrderView
 from zsched.commands.report import render_status
 
 TEXT = "fleet: lab\n"
@@ -105,7 +105,7 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    monkeypatch.setattr(verbs, "PAUSE_S", 0.001)
+    monkeypatch.setattr("zsched.commands.change.PAUSE_S", 0.001)
     running = Daemon()
     with answering(running.answer, tmp_path, monkeypatch):
         yield running

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,9 +17,12 @@ from support.schemas import faults
 from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.cli import app
 from zsched.commands import history as verb
+from zsched.commands import history as verbs
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.history import EventsView, duration_s, events, history, subject_of, types_of
+from zsched.commands.history import EventsView, subject_of, types_of
+from zsched.commands.history import show_events as events
+from zsched.commands.page import duration_s
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Move
@@ -66,6 +70,8 @@ class Pages:
 
     def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
         assert timeout_s > 0
+        if request["verb"] == "status":
+            return STATUS
         self.asked.append(request)
         self.nodes.append(door.node)
         if self.is_away:
@@ -97,9 +103,16 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
         entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
     )
     monkeypatch.setattr(verb, "ask_door", made.ask)
-    monkeypatch.setattr("zsched.commands.document.status_of", lambda _door: STATUS)
     monkeypatch.setattr("zsched.commands.history.time.sleep", lambda _s: None)
     return made
+
+
+def history(
+    door: Door, task: str | None, *, is_json: bool, about: str | None = None, since_s: float | None = None
+) -> int:
+    said: Any = SimpleNamespace(door=lambda: door, json_=is_json)
+    of_node = None if about is None else f"node/{about}"
+    return verbs.history(said, task, of_node, None if since_s is None else f"{since_s}s")
 
 
 def view(**given: Any) -> EventsView:

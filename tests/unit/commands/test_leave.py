@@ -19,7 +19,7 @@ from support.schemas import faults
 from zsched.adapters.host.operator_socket import Json, OperatorSocket
 from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
-from zsched.commands import flags, leave
+from zsched.commands import leave
 from zsched.commands.renewing import UNIT_FOLDER
 from zsched.config.load import load_fleet
 from zsched.core.values.electorate import Elector
@@ -151,8 +151,7 @@ def hall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hall]:
     monkeypatch.delenv("ZSCHED_NODE", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.delenv("ZSCHED_AUTHORITY", raising=False)
-    for module in (flags, leave):
-        monkeypatch.setattr(module, "PAUSE_S", 0.001)
+    monkeypatch.setattr("zsched.commands.change.PAUSE_S", 0.001)
     (tmp_path / "fleet.yaml").write_text(TEXT)
     fleet = load_fleet(tmp_path / "fleet.yaml")
     state = blank_state(fleet, "robot3", 0, None, incarnation=1, hardware="", disk="01")
@@ -401,10 +400,11 @@ def test_whatever_the_others_agree_it_asks_before_it_puts_files_away(
         with pytest.raises(SystemExit) as ended:
             app(["leave", *words])
         assert ended.value.code == code
-        table, _, after = capsys.readouterr().out.partition("Do it? [y/N] ")
+        told = capsys.readouterr()
+        table = told.out.partition("Do it? [y/N] ")[0]
         assert [hall.folder.name in line for line in table.splitlines() if "the fleet file" in line] == [True]
         assert ["the", "fleet", "file", "deleted"] in [line.split()[2:] for line in table.splitlines()]
-        assert ("Nothing was done." in after) is (code == 1)
+        assert ("nothing was done" in told.err) is (code == 1)
     assert left(hall.folder) == ["lock"]
 
 

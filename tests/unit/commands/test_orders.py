@@ -16,8 +16,8 @@ from support.schemas import faults
 from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands.brief import render_brief
+from zsched.commands.change import user_name
 from zsched.commands.common import CliError
-from zsched.commands.orders import user_name
 from zsched.commands.report import render_status
 from zsched.commands.tune import KEYS, tuned
 from zsched.core.values.words import CREATION_STEP
@@ -153,7 +153,7 @@ def test_an_order_that_is_given_again_changes_nothing_but_for_another_reason_or_
         ("bob", (), 4, "lens"),
         ("bob", ("-m", "fan"), 5, "fan"),
     ):
-        monkeypatch.setattr("zsched.commands.orders.user_name", lambda user=user: user)
+        monkeypatch.setattr("zsched.commands.change.user_name", lambda user=user: user)
         before = len(daemon.orders)
         said = run(*words, *more, "--yes").stdout
         assert ("Nothing would change." in said) is (before == orders)

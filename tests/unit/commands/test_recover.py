@@ -14,7 +14,9 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.commands.common import CliError, Json
 from zsched.commands.history import changes_of
 from zsched.commands.init import Place
-from zsched.commands.recover import Manner, recover, rejoin
+from zsched.commands.recover import Manner
+from zsched.commands.recover import begin_generation as recover
+from zsched.commands.recover import rejoin_side as rejoin
 from zsched.config.load import load_fleet
 from zsched.core.values.durable import DurableState
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
@@ -162,9 +164,9 @@ def test_off_a_terminal_it_takes_yes_and_at_one_the_answer_counts(
     code, text = refusal(lambda: recover(hall.place("robot1"), accepted, ()))
     assert code == EXIT_USAGE
     again = "zsched the words --yes"
-    assert text == f"nothing was changed; to change it without being asked:\n{again}"
+    assert text == f"nothing was done, for nobody can be asked here; to do it:\n{again}"
     at_a_terminal(monkeypatch, "n")
-    assert refusal(lambda: recover(hall.place("robot1"), accepted, ())) == (EXIT_FAILED, "nothing was changed")
+    assert refusal(lambda: recover(hall.place("robot1"), accepted, ())) == (EXIT_FAILED, "nothing was done")
     assert hall.file_of("robot1").read_bytes() == before
     at_a_terminal(monkeypatch, "y")
     assert recover(hall.place("robot1"), accepted, ()) == EXIT_OK

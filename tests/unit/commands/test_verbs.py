@@ -472,7 +472,7 @@ def test_ctrl_c_ends_a_ping_that_waits_for_answers(tmp_path: Path, monkeypatch: 
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("zsched.commands.ping.ping", ask)
+    monkeypatch.setattr("zsched.commands.ping.measure", ask)
     (tmp_path / "fleet.yaml").write_text(FLEET)
     fleet = load_fleet(tmp_path / "fleet.yaml")
     before = signal.signal(signal.SIGALRM, interrupt)

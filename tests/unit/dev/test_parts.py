@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from zsched.cli import app
 from zsched.commands.common import CliError
-from zsched.commands.dev import DEFAULT_JOINS, ENTER, DevOptions, _commands, application, dev, entrance, json5
+from zsched.commands.dev import DEFAULT_JOINS, ENTER, _commands, application, dev, entrance, json5
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeId
 from zsched.dev.nodes import shares
@@ -90,7 +90,7 @@ def test_the_application_is_started_by_one_line_from_any_folder(tmp_path: Path) 
 
 def test_a_folder_without_a_fleet_file_is_said(tmp_path: Path) -> None:
     with pytest.raises(CliError, match=r"no fleet\.yaml in the folder .*zsched new python"):
-        dev(DevOptions(file=tmp_path, workers=()))
+        dev(tmp_path)
 
 
 def test_a_worker_is_named_alone_or_with_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +115,7 @@ def test_without_a_file_it_says_how_to_begin(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
     with pytest.raises(CliError, match="zsched new python") as told:
-        dev(DevOptions(file=None, workers=()))
+        dev()
     assert told.value.code == 78
 
 

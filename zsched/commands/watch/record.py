@@ -10,18 +10,21 @@ import contextlib
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, Annotated, BinaryIO, Final
+
+import typer
 
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import Away, CliError, Json, stopped_by_signal, warn
-from zsched.commands.page import size
+from zsched.commands.common import Away, CliError, stopped_by_signal, warn
+from zsched.commands.options import Asks
+from zsched.commands.page import duration_s, size
 from zsched.commands.watch import tracks
 from zsched.commands.watch.feed import Feed
 from zsched.core.route import keyexpr
-from zsched.core.values.struct import Struct, replace
+from zsched.core.values.struct import replace
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.latch import Latch
@@ -34,46 +37,50 @@ if TYPE_CHECKING:
 LIBRARY: Final = "zsched"
 
 
-class RecordView(Struct, frozen=True, kw_only=True):
-    """Which daemon to ask, and what to write."""
+def record(
+    asked: Asks,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new file, as run.mcap.")],
+    for_: Annotated[
+        str | None, typer.Option("--for", metavar="DURATION", help="How long: 90s, 10m, 2h. [until Ctrl-C]")
+    ] = None,
+    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map", metavar="KEY", help="A key whose samples are maps (OccupancyGrid, CDR) is recorded, too."
+        ),
+    ] = None,
+    tf: Annotated[
+        list[str] | None,
+        typer.Option("--tf", metavar="KEY", help="The same of a key whose samples are frames (TFMessage, CDR)."),
+    ] = None,
+) -> int:
+    """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps, tf.
 
-    find: Callable[[], Door]
-    file: Path
-    interval_s: float
-    for_s: float | None
-    """For how long; ``None``: until Ctrl-C."""
-    maps: tuple[str, ...] = ()
-    """Key expressions whose samples are maps, besides those that say so by their ROS type."""
-    frames: tuple[str, ...] = ()
-    """The same of transforms (tf)."""
-
-
-def record(view: RecordView) -> int:
-    """Record until Ctrl-C, SIGTERM, or the time is over; returns the exit code.
-
-    Raises:
-        CliError: nobody answers (3), the file is there already or cannot be written (1), a key is none (2), or the
-            library that writes is not installed (1).
+    Needs the extra mcap. Maps and frames on ROS topics are found by their type.
     """
-    for option, keys in (("--map", view.maps), ("--tf", view.frames)):
+    maps, frames = tuple(map_ or ()), tuple(tf or ())
+    for_s = float("inf") if for_ is None else duration_s(for_)
+    for option, keys in (("--map", maps), ("--tf", frames)):
         for key in keys:
             if (fault := keyexpr.fault(key)) is not None:
                 raise CliError(EXIT_USAGE, f"{option}: {key!r} is no key expression: {fault}")
-    feed = Feed(view.find)
+    feed = Feed(asked.door)
     door = feed.door()
-    if door.cell is not None and (view.maps or view.frames):
+    if door.cell is not None and (maps or frames):
         raise CliError(EXIT_USAGE, "--map and --tf join the data network: record them on a machine of that fleet")
-    if door.endpoint and (view.maps or view.frames):
+    if door.endpoint and (maps or frames):
         raise CliError(EXIT_USAGE, "--map and --tf join the data network of a daemon here; --connect only asks")
     first = feed.ask()
     if first.status is None:
         raise CliError(first.code, first.why)
     with contextlib.ExitStack() as stack:
-        kinds = {} if door.endpoint else _ros_keys(first.status, view)
+        named = {**dict.fromkeys(maps, tracks.GRID), **dict.fromkeys(frames, tracks.FRAMES)}
+        kinds = {} if door.endpoint else {**tracks.ros_keys(first.status), **named}
         tap = stack.enter_context(_tapped(door, tuple(kinds)))
-        tape = stack.enter_context(_taped(view.file, kinds))
+        tape = stack.enter_context(_taped(output, kinds))
         ended = stack.enter_context(stopped_by_signal())
-        end = float("inf") if view.for_s is None else monotonic_s() + view.for_s
+        end = monotonic_s() + for_s
         news, away = replace(first, entries=()), Away("record")  # the log of before is no part of the recording
         is_over = False
         while True:
@@ -85,11 +92,11 @@ def record(view: RecordView) -> int:
                     tape.put(message)
             if is_over:
                 break
-            _wait(min(monotonic_s() + view.interval_s, end), tap, tape, ended)
+            _wait(min(monotonic_s() + interval, end), tap, tape, ended)
             is_over = ended.is_set() or monotonic_s() >= end  # what has happened since the last look belongs to it
             news = feed.ask()
             away.tell(news.why or news.log_why)
-    told = f"{view.file}: {tape.messages} messages of {len(tape.topics)} topics, {size(view.file.stat().st_size)}"
+    told = f"{output}: {tape.messages} messages of {len(tape.topics)} topics, {size(output.stat().st_size)}"
     missed = "" if tap is None else tap.told("written")
     warn(f"{told}; {missed}" if missed else told)
     return EXIT_OK
@@ -104,12 +111,6 @@ def _wait(until: float, tap: StreamTap | None, tape: Tape, ended: Latch) -> None
         for sample in tap.until(min(now + 0.2, until)):
             if sample.kind == "put" and sample.side == "fleet":
                 tape.put_ros(sample.key, sample.payload, wall_s() - (monotonic_s() - sample.at))
-
-
-def _ros_keys(status: Json, view: RecordView) -> dict[str, str]:
-    """{key expression: ROS 2 type} of what is recorded as it was published."""
-    named = {**dict.fromkeys(view.maps, tracks.GRID), **dict.fromkeys(view.frames, tracks.FRAMES)}
-    return {**tracks.ros_keys(status), **named}
 
 
 @contextlib.contextmanager
@@ -197,3 +198,6 @@ def _taped(path: Path, kinds: dict[str, str]) -> Iterator[Tape]:
                     writer.finish()  # type: ignore[no-untyped-call]
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{path} cannot be written any more: {error.strerror}") from error
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

@@ -17,11 +17,14 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import Annotated, Final
+
+import typer
 
 from zsched.clock import wall_s
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError, wants_color
+from zsched.commands.options import Asks, NoColorOption
 from zsched.commands.status import code_of
 from zsched.commands.watch.feed import Feed, News
 from zsched.commands.watch.past import Past
@@ -49,7 +52,7 @@ class TopView(Struct, frozen=True, kw_only=True):
     interval_s: float
 
 
-def top(view: TopView, *, is_once: bool) -> int:
+def show_top(view: TopView, *, is_once: bool) -> int:
     """Show the fleet until ``q``, Ctrl-C or SIGTERM, or once; returns the exit code of the last answer, or of none.
 
     Raises:
@@ -148,3 +151,16 @@ def _frame(view: TopView, first_task: int) -> Frame:
         first_task=first_task,
         period_s=max(view.interval_s, 1.0),
     )
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
+
+
+def top(
+    asked: Asks,
+    once: Annotated[bool, typer.Option("--once", help="Print one screen and exit, as status does.")] = False,
+    interval: Annotated[float, typer.Option(min=0.2, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    no_color: NoColorOption = False,
+) -> int:
+    """Show the fleet on the full screen: nodes, utilities over time, streams, the last moves; q ends."""
+    return show_top(TopView(find=asked.door, is_plain=no_color, interval_s=interval), is_once=once)

@@ -9,16 +9,18 @@ import logging
 import re
 import secrets
 import sys
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Final
 from urllib.parse import urlsplit
 
+import typer
+
 from zsched.clock import wall_s
-from zsched.commands.ask import Door
 from zsched.commands.common import Away, CliError, stopped_by_signal, warn
+from zsched.commands.options import Local
+from zsched.commands.page import duration_s
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.spans import Moves, Span, trace_id
-from zsched.core.values.struct import Struct
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 
 if TYPE_CHECKING:
@@ -32,37 +34,32 @@ MAX_WHY: Final = 160
 """...and we of the first one, in at most as many characters."""
 
 
-class TraceView(Struct, frozen=True, kw_only=True):
-    """Whose log is read, and where spans go."""
+def trace(
+    asked: Local,
+    otlp: Annotated[
+        str, typer.Option("--otlp", metavar="URL", help="An OpenTelemetry collector (OTLP over HTTP).")
+    ] = "http://127.0.0.1:4318",
+    since: Annotated[
+        str | None, typer.Option("--since", metavar="AGE", help="Also moves not older: 90s, 10m, 2h, 1d.")
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Only what the decision log holds, then end.")] = False,
+) -> int:
+    """Send a trace span for each move in this machine's decision log to an OpenTelemetry collector.
 
-    find: Callable[[], Door]
-    url: str
-    """A collector, as http://127.0.0.1:4318."""
-    since_s: float | None
-    """Also moves that are not older; ``None``: from now on."""
-    is_once: bool
-    """End with the log's last line."""
-
-
-def trace(view: TraceView) -> int:
-    """Send spans until Ctrl-C or SIGTERM; returns the exit code.
-
-    Raises:
-        CliError: nobody answers (3), another machine's log or no address of a collector is meant (2), or the library
-            that sends is not there (1).
+    Needs the extra trace. Exits with 1 when the collector refused one.
     """
-    if not _is_collector(view.url):
-        raise CliError(EXIT_USAGE, f"--otlp {view.url}: no address of a collector; write it as http://HOST:4318")
-    feed = Feed(view.find)
+    if not _is_collector(otlp):
+        raise CliError(EXIT_USAGE, f"--otlp {otlp}: no address of a collector; write it as http://HOST:4318")
+    feed = Feed(asked.door)
     if (node := feed.door().node) is not None:
         raise CliError(EXIT_USAGE, f"the log of {node} lies on its machine: ask there")
     news = feed.ask()
     if news.status is None:
         raise CliError(news.code, news.why)
-    if news.log_why and view.is_once:
+    if news.log_why and once:
         raise CliError(EXIT_FAILED, f"nothing was sent: {news.log_why}")
-    sender, moves = Sender(view.url, news.status["fleet"], news.status["node"]), Moves()
-    oldest, away = news.at - (view.since_s or 0.0), Away("trace")
+    sender, moves = Sender(otlp, news.status["fleet"], news.status["node"]), Moves()
+    oldest, away = news.at - (0.0 if since is None else duration_s(since)), Away("trace")
     away.tell(news.log_why)
 
     def send(spans: Iterable[Span]) -> None:
@@ -70,11 +67,11 @@ def trace(view: TraceView) -> int:
 
     with stopped_by_signal() as ended:
         send(moves.take(news.entries))
-        while not view.is_once and not ended.wait(PERIOD_S):
+        while not once and not ended.wait(PERIOD_S):
             news = feed.ask()
             away.tell(news.why or news.log_why)
             send((*moves.take(news.entries), *moves.overdue(wall_s())))
-    if view.is_once:
+    if once:
         send(moves.rest())
     warn(f"{sender.sent} spans sent, {sender.refused} refused")
     return EXIT_FAILED if sender.refused else EXIT_OK
@@ -187,3 +184,6 @@ def _attributes(span: Span) -> dict[str, str | int | float]:
 
 def _ns(at: float) -> int:
     return round(at * 1e6) * 1000
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------

@@ -18,18 +18,18 @@ import os
 import queue
 import socket
 import threading
-from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
+
+import typer
 
 from zsched.clock import monotonic_s
-from zsched.commands.ask import Door
 from zsched.commands.common import CliError, Json, stopped_by_signal, warn
+from zsched.commands.options import Asks
 from zsched.commands.watch.feed import Feed
 from zsched.commands.watch.gate import EXPLAIN, FILES, HEADERS, LEAST_TOKEN, LIVE, METRICS, Asked, Gate, Refusal, Route
 from zsched.commands.watch.hub import Hub
-from zsched.core.values.struct import Struct
 from zsched.errors import ZschedError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.files import read_regular
@@ -49,39 +49,37 @@ MOST_HEAD_BYTES: Final = 16384
 """Of a request: its line and all headers, among them what a proxy adds."""
 
 
-class WebView(Struct, frozen=True, kw_only=True):
-    """Which daemon to ask, where to listen, and who may look."""
+def web(
+    asked: Asks,
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="ADDRESS:PORT", help="Where; beyond this machine only with a token.")
+    ] = "127.0.0.1:7459",
+    token_file: Annotated[
+        Path | None,
+        typer.Option("--token-file", metavar="FILE", help="Readers must know its only word. [ZSCHED_WEB_TOKEN]"),
+    ] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option("--host", metavar="NAME", help="Browsers may call this server so, besides its addresses."),
+    ] = None,
+) -> int:
+    """Serve a page that shows the fleet live, and Prometheus' figures under /metrics; it changes nothing.
 
-    find: Callable[[], Door]
-    listen: str
-    token_file: Path | None
-    hosts: tuple[str, ...]
-
-
-def web(view: WebView) -> int:
-    """Serve until SIGINT or SIGTERM; returns the exit code.
-
-    A daemon that is not there yet is waited for.
-
-    Raises:
-        CliError: the place cannot be had (1), it is not loopback and there is no token (2), or several daemons run here
-            and none is meant (2).
+    It asks one daemon once a second, however many look; a daemon that is not there is waited for.
     """
-    host, port = endpoint_of(view.listen)
-    token = token_of(view.token_file)
-    if not token and not ipaddress.ip_address(host).is_loopback:
-        raise CliError(
-            EXIT_USAGE, f"--listen {view.listen} is open to other machines: give a token with --token-file FILE"
-        )
-    feed = Feed(view.find)
+    address, port = endpoint_of(listen)
+    token = token_of(token_file)
+    if not token and not ipaddress.ip_address(address).is_loopback:
+        raise CliError(EXIT_USAGE, f"--listen {listen} is open to other machines: give a token with --token-file FILE")
+    feed = Feed(asked.door)
     try:
         feed.door()
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
             raise
         warn(f"zsched web: {error}; asking again")
-    names = {"localhost", socket.gethostname().lower(), *(name.lower() for name in view.hosts)}
-    server = WebServer(host, port, Gate(names=frozenset(names), token=token), Hub(feed))
+    names = {"localhost", socket.gethostname().lower(), *(name.lower() for name in host or ())}
+    server = WebServer(address, port, Gate(names=frozenset(names), token=token), Hub(feed))
     with contextlib.closing(server), stopped_by_signal() as ended:
         server.start()
         warn(f"zsched web: {server.address}{', with a token' if token else ''}; Ctrl-C ends it")
@@ -349,3 +347,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the standard library's name
         """Nothing: addresses of requests are not kept."""
+
+
+# --- on the command line ----------------------------------------------------------------------------------------------
