@@ -17,26 +17,30 @@ import typer
 
 from zsched import paths as places
 from zsched.commands.ask import Door
-from zsched.commands.change import OrderView, Plan, asker, check_revision, consent
-from zsched.commands.common import (
-    CliError,
-    Json,
-    check_dangers,
-    print_json,
-    warn,
-)
-from zsched.commands.document import (
+from zsched.commands.change import (
     QUESTION,
     InForce,
+    OrderView,
+    Plan,
     ask_all,
+    asker,
     change,
     change_over,
+    check_revision,
+    consent,
     document_text,
     fleet_of,
     in_force,
     ordered,
     status_of,
     wait_until_settled,
+)
+from zsched.commands.common import (
+    CliError,
+    Json,
+    check_dangers,
+    print_json,
+    warn,
 )
 from zsched.commands.options import Changes, PauseAfterOption
 from zsched.commands.page import cut

@@ -186,6 +186,3 @@ def _lines(path: Path, members: tuple[Member, ...]) -> Iterator[str]:
     for member in members:
         yield f"{member.name:<28} {f'not there: {member.missing}' if member.missing else size(len(member.content))}"
     yield f"{path}: secrets that a name gives away are taken out; read it before you hand it on"
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

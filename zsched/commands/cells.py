@@ -151,9 +151,6 @@ def _code(cells: list[Json]) -> int:
     return EXIT_DEGRADED if any(cell["error"] is not None or cell["degraded"] for cell in cells) else EXIT_OK
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 def of_site(asked: Asks) -> tuple[Path | None, str | None]:
     """(folder of sockets, node) of the daemon here, which knows the cells. Raises `CliError`: another one is meant."""
     if asked.connect is not None or "/" in (asked.node or ""):

@@ -120,9 +120,6 @@ def _from_file(kind: str) -> list[str]:
     return []
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 def complete(
     ctx: typer.Context,
     words: Annotated[list[str] | None, typer.Argument(metavar="WORD...", help="Typed so far.")] = None,

@@ -250,6 +250,3 @@ def _say_to_copy(text: str) -> None:
 
 def _show(status: Json) -> None:
     print(render_status(status, max(shutil.get_terminal_size().columns, NARROW), color=wants_color(False)), flush=True)
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

@@ -112,6 +112,3 @@ def _wrapped(texts: Iterable[str], width: int) -> list[str]:
 
 def _counts(results: Results) -> Counter[Verdict]:
     return Counter(result.verdict for _, result in results)
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

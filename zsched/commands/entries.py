@@ -12,8 +12,8 @@ from typing import Annotated
 import typer
 
 from zsched.commands.apply import Draft, agree, apply_change, read_text
+from zsched.commands.change import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
 from zsched.commands.common import CliError, Json, check_known
-from zsched.commands.document import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
 from zsched.commands.options import Changes, Orders, new_group
 from zsched.commands.rollout import promoted
 from zsched.config.editing import add_entries, remove_node, remove_task

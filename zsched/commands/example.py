@@ -69,6 +69,3 @@ def write_example(example: Example, folder: Path) -> tuple[Path, ...]:
     except OSError as error:
         raise CliError(EXIT_FAILED, f"cannot write {error.filename or folder}: {error.strerror}") from error
     return tuple(folder / name for name in files)
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ With ``--at`` a judgement of the past, out of the decision log of the node that 
 
 Knows: which daemon to ask, the text, the schema ``zsched.explain/1``. Does not know: how a sum comes about
 (`zsched.core.scheduler.explain`: the daemon tells the sums of its last judgement, others are made here, by
-`zsched.commands.judgement`), where a log lies (`zsched.adapters.host.decision_log`).
+`zsched.commands.replay`), where a log lies (`zsched.adapters.host.decision_log`).
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, wants_color, warn
 from zsched.commands.history import is_known, is_move, wall_text, when_of, where_of
 from zsched.commands.options import Answers, NoColorOption
-from zsched.commands.page import Cell, Page, age_s_of, memory, name_room, short_name, span
-from zsched.commands.weight_words import shares
+from zsched.commands.page import Cell, Page, age_s_of, memory, name_room, shares, short_name, span
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.veto import Filter
 from zsched.core.values.words import PAPER_METRICS, meant, shown
@@ -75,12 +74,12 @@ def explain(
     else:
         body, written = explanation(door, task) if robot is None else _of_robot(door, task, robot)
     if robot is not None:
-        from zsched.commands.judgement import sight  # noqa: PLC0415 - loads the scheduler, which takes as long as this
+        from zsched.commands.replay import sight  # noqa: PLC0415 - loads the scheduler, which takes as long as this
 
         body["robot"] = sight(written, robot, str(body["node"]))
     code = EXIT_OK
     if gone is not None:
-        from zsched.commands.judgement import planned  # noqa: PLC0415 - as above
+        from zsched.commands.replay import planned  # noqa: PLC0415 - as above
 
         body["plan"] = planned(written, gone)
         code = EXIT_WOULD_CHANGE if body["plan"]["would_move"] else EXIT_OK
@@ -116,7 +115,7 @@ def explanation(door: Door, task: str) -> tuple[Json, Json]:
 
 
 def _sums(written: Json) -> Json:
-    from zsched.commands.judgement import sums  # noqa: PLC0415 - as above
+    from zsched.commands.replay import sums  # noqa: PLC0415 - as above
 
     return sums(written)
 
@@ -494,6 +493,3 @@ def _changes(page: Page, body: Json) -> None:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f}"
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

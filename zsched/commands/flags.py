@@ -1,7 +1,7 @@
 """`zsched drain` and `undrain`: shows what a flag changes, has it agreed, and watches a node become empty.
 
 Knows: how flags are shown before and after, the danger in one, when a node is empty. Does not know: how a document is
-agreed (`zsched.commands.document`), what a robot makes of a flag (`zsched.core.scheduler.flags`).
+agreed (`zsched.commands.change`), what a robot makes of a flag (`zsched.core.scheduler.flags`).
 """
 
 from __future__ import annotations
@@ -16,21 +16,27 @@ import typer
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door
 from zsched.commands.change import (
+    DOCUMENT,
     NOTHING,
+    InForce,
     OrderView,
     OverError,
     Plan,
     Row,
+    change_over,
     check_revision,
     consent,
     counted_before,
+    document_text,
+    in_force,
     lost_since,
+    ordered,
+    status_of,
     statuses_of,
     told_switch,
     until,
 )
 from zsched.commands.common import CliError, Json, check_dangers, check_known, print_json, say, told_task
-from zsched.commands.document import DOCUMENT, InForce, change_over, document_text, in_force, ordered, status_of
 from zsched.commands.options import Changes, ForOption, Orders
 from zsched.commands.page import duration_s, span
 from zsched.commands.report import told_flag

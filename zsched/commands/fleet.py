@@ -17,9 +17,8 @@ from typing import Any
 
 from zsched.commands.apply import apply_change, read_text
 from zsched.commands.ask import PASSES_ON
-from zsched.commands.change import OrderView
+from zsched.commands.change import QUESTION, InForce, OrderView, ask_all, document_text, in_force, status_of
 from zsched.commands.common import CliError, Json, print_json, say, warn
-from zsched.commands.document import QUESTION, InForce, ask_all, document_text, in_force, status_of
 from zsched.commands.flags import SEAT_ADVICE, without_seat
 from zsched.commands.membership import create
 from zsched.commands.options import Answers, Asks, Edits, OutputOption, PauseAfterOption, new_group
@@ -180,9 +179,6 @@ def _open_editor(path: Path, env: Mapping[str, str]) -> None:
         raise CliError(EXIT_FAILED, f"the editor {editor!r} cannot be started: {error}; set EDITOR") from error
     if done.returncode:
         raise CliError(EXIT_FAILED, f"the editor {editor!r} ended with {done.returncode}; nothing was changed")
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------
 
 
 def edit(said: Edits, pause_after: PauseAfterOption = None) -> int:

@@ -353,9 +353,6 @@ def wall_text(at: float) -> str:
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 def events(
     asked: Local,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,

@@ -11,9 +11,19 @@ from typing import Annotated, Final
 import typer
 
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.change import NOTHING, OrderView, Plan, consent, refused, tell_results, until
+from zsched.commands.change import (
+    CODES,
+    NOTHING,
+    OrderView,
+    Plan,
+    ask_all,
+    consent,
+    refused,
+    status_of,
+    tell_results,
+    until,
+)
 from zsched.commands.common import CliError, Json, check_known, print_json, say
-from zsched.commands.document import CODES, ask_all, status_of
 from zsched.commands.options import ForOption, Orders
 from zsched.commands.page import span
 from zsched.commands.report import told_hold

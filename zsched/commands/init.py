@@ -155,9 +155,6 @@ def _heard(heard: Heard, name: str, generation: int, *, is_elector: bool) -> str
     return f"{said}: none remembers a vote of {name}{where}" if is_elector else said
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 def init(
     here: Here,
     accept: Annotated[

@@ -368,9 +368,6 @@ def _tell(done: str, files: Iterable[tuple[Path, str]]) -> None:
         say(f"{done}{where}: {what}")
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 RootOption = Annotated[
     Path, typer.Option("--root", metavar="DIR", help="Below this folder instead; starts, stops and asks nothing.")
 ]

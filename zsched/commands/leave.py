@@ -20,21 +20,29 @@ import typer
 from zsched import paths
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, find_door
-from zsched.commands.change import NOTHING, OrderView, OverError, Plan, Row, check_said, consent, lined, until
-from zsched.commands.common import CliError, Json, again, check_dangers, check_taken, say, warn
-from zsched.commands.document import (
+from zsched.commands.change import (
     DOCUMENT,
     HERE,
+    NOTHING,
     QUESTION,
     UNKNOWING,
     InForce,
+    OrderView,
+    OverError,
+    Plan,
+    Row,
     ask_all,
     change,
+    check_said,
+    consent,
     document_text,
     fleet_of,
     in_force,
+    lined,
     ordered,
+    until,
 )
+from zsched.commands.common import CliError, Json, again, check_dangers, check_taken, say, warn
 from zsched.commands.flags import (
     LEAVE,
     NO_OTHER,

@@ -203,9 +203,6 @@ def _print(view: LogsView, node: str, task: str, lines: list[Json]) -> None:
     sys.stdout.flush()
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 def logs(
     asked: Answers,
     task: TaskArgument,

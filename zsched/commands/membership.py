@@ -22,8 +22,8 @@ import typer
 from zsched import paths as places
 from zsched.commands.apply import apply_change
 from zsched.commands.ask import CONTROL_PORT, Door, ask_door
+from zsched.commands.change import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
 from zsched.commands.common import CliError, Json, again, check_name, nearest, print_json, say, uninterrupted, warn
-from zsched.commands.document import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
 from zsched.commands.options import AcceptOption, Edits, Files, Here, JsonOption, OutputOption, PlanOption
 from zsched.commands.papers import (
     FirstPapers,

@@ -220,7 +220,4 @@ def _replace(path: Path, text: str) -> None:
         raise CliError(EXIT_FAILED, f"{path} cannot be written: {error.strerror}; see its folder") from error
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 metrics = new_group("metrics", "Figures for Prometheus.", {"print": metrics_print, "write": metrics_write})

@@ -18,12 +18,12 @@ from zsched.commands.change import (
     consent,
     counted_before,
     lost_since,
+    status_of,
     statuses_of,
     told_switch,
     until,
 )
 from zsched.commands.common import CliError, Json, check_known, print_json, say, told_task
-from zsched.commands.document import status_of
 from zsched.commands.options import Orders, TaskArgument
 from zsched.commands.page import span
 from zsched.commands.wait import Condition, missing

@@ -10,8 +10,9 @@ import textwrap
 import time
 from typing import Any, Final, TypeAlias
 
-from zsched.commands.common import CliError
-from zsched.core.values.words import missed
+from zsched.commands.common import CliError, Json
+from zsched.core.values.gauges import BY_NAME
+from zsched.core.values.words import PAPER_METRICS, missed
 from zsched.exits import EXIT_USAGE
 
 STYLES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "stage": "1;36", "alarm": "1;31"}
@@ -192,3 +193,16 @@ def size(count: int) -> str:
             return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
         value /= 1024
     raise AssertionError
+
+
+NAMES = (*PAPER_METRICS, *BY_NAME)
+
+
+def shares(weights: Json) -> dict[str, float]:
+    """``{metric: weight}`` of a status' weights, or of some: the paper's three, and the gauges that have one.
+
+    >>> shares({"cpu": 0.7, "memory": 0.0, "network": 0.0, "gauges": {"gpu": 0.3}})
+    {'cpu': 0.7, 'memory': 0.0, 'network': 0.0, 'gpu': 0.3}
+    """
+    found = {**weights, **weights.get("gauges", {})}  # a later field of the schema's major version
+    return {name: found.get(name, 0.0) for name in NAMES if name in PAPER_METRICS or found.get(name)}

@@ -209,6 +209,3 @@ def _lines(node: NodeId, ways: list[Way], heard: Json) -> Iterator[str]:
     for listener, speakers in heard.items():
         for speaker, state in speakers.items():
             yield f"{listener} finds {speaker} {state}"
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

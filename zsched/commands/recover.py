@@ -158,9 +158,6 @@ def _next(plan: Recovery, value: FleetValue) -> str:
     return "\n".join(lines)
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 def recover_fleet(
     here: Here,
     wanted: Annotated[

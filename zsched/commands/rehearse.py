@@ -20,9 +20,8 @@ import typer
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.change import OrderView, Plan, Row, asker, consent
+from zsched.commands.change import IN_FORCE_S, OrderView, Plan, Row, asker, consent, document_text, in_force
 from zsched.commands.common import CliError, Json, ends_as_by_ctrl_c, nearest, print_json, say, told_task, warn
-from zsched.commands.document import IN_FORCE_S, document_text, in_force
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
 from zsched.commands.options import Orders
 from zsched.commands.page import counted
@@ -603,9 +602,6 @@ def _sights(tasks: Mapping[str, Json]) -> list[Sight]:
         for robot, task in tasks.items()
         for stream in task["streams"]
     ]
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------
 
 
 def rehearse(

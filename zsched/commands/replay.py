@@ -1,6 +1,9 @@
 """`zsched explain --replay FILE`: makes every judgement of a decision log again, and compares it with what was decided.
 
-Knows: lines of a log, exit codes. Does not know: how a judgement is made (`zsched.core.scheduler.decision`).
+It also reckons with a written judgement for `zsched explain`: its sums, what a robot sees, without a node.
+
+Knows: lines of a log, the written form, exit codes. Does not know: how a judgement is made
+(`zsched.core.scheduler.decision`). It loads the scheduler, so `explain` imports it only when it reckons.
 """
 
 from __future__ import annotations
@@ -10,9 +13,11 @@ import sys
 from pathlib import Path
 
 from zsched.adapters.host.decision_log import is_torn
-from zsched.commands.common import CliError, print_json, say
+from zsched.commands.common import CliError, Json, nearest, print_json, say
 from zsched.commands.page import counted
+from zsched.core.report import plain
 from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.scheduler.explain import explained, judged_again, seen_by, without
 from zsched.core.values.decision import Decision
 from zsched.errors import WireError
 from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
@@ -80,3 +85,53 @@ def _decision(line: bytes) -> tuple[Decision | None, object]:
 
 def _told(verdict: object) -> str:
     return harmless(json.dumps(verdict, ensure_ascii=False))
+
+
+def read(written: Json) -> Decision:
+    """The judgement.
+
+    Raises:
+        CliError: another version has written it, or it is damaged.
+    """
+    try:
+        return from_plain(written, Decision)
+    except WireError as error:
+        text = f"the judgement cannot be read ({error}); update the older of the two, zsched here or the daemon"
+        raise CliError(EXIT_FAILED, text) from error
+
+
+def sums(written: Json) -> Json:
+    """Its sums, as ``zsched.explain/1`` has them."""
+    told: Json = plain(explained(read(written)))
+    return told
+
+
+def sight(written: Json, robot: str, judge: str) -> Json:
+    """What the robot sees, as ``zsched.explain/1`` has it.
+
+    Raises:
+        CliError: it is no robot of the fleet.
+    """
+    decision = read(written)
+    robots = decision.figures.voters
+    if robot not in robots:
+        raise CliError(EXIT_USAGE, f"--robot: the fleet has no robot {robot!r}{nearest(robot, robots)}")
+    told: Json = plain(seen_by(decision, robot, judge))
+    return told
+
+
+def planned(written: Json, gone: str) -> Json:
+    """The judgement without a node, and whether the task would move.
+
+    Raises:
+        CliError: the node is no candidate, robot or elector.
+    """
+    decision = read(written)
+    figures = decision.figures
+    known = sorted({*figures.rules.candidates, *figures.voters, *figures.electors})
+    if gone not in known:
+        raise CliError(EXIT_USAGE, f"--plan: {gone!r} is no candidate, robot or elector{nearest(gone, known)}")
+    again = judged_again(decision, without(figures, gone))
+    told: Json = plain(explained(again))
+    moves = again.verdict.outcome == "propose" and again.verdict.candidate != figures.allocation.owner
+    return {"without": gone, "would_move": moves, **told}

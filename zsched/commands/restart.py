@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from zsched.commands.ask import ask_door
-from zsched.commands.change import Plan, consent
+from zsched.commands.change import CODES, Plan, consent, status_of
 from zsched.commands.common import CliError, Json, print_json, say, told_task
-from zsched.commands.document import CODES, status_of
 from zsched.commands.logs import worker_node
 from zsched.commands.options import Consents, TaskArgument
 from zsched.exits import EXIT_FAILED

@@ -73,7 +73,7 @@ def watch_on(view: StatusView, interval_s: float) -> int:
 def _render(view: StatusView, status: Json) -> str:
     if view.is_whole:
         return render_status(status, _width(), wants_color(view.is_plain), wall_ns() / 1e9)
-    from zsched.commands.brief import render_brief  # noqa: PLC0415 - only what is shown is loaded
+    from zsched.commands.report import render_brief  # noqa: PLC0415 - only what is shown is loaded
 
     return render_brief(status, _width(), wants_color(view.is_plain), wall_ns() / 1e9)
 
@@ -147,9 +147,6 @@ def code_of(status: Json) -> int:
 
 def _width() -> int:
     return max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------
 
 
 def status(

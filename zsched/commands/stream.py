@@ -363,9 +363,6 @@ def _asked(door: Door) -> Json:
     return {} if door.node is None else {"node": door.node}
 
 
-# --- on the command line ----------------------------------------------------------------------------------------------
-
-
 KeyArgument = Annotated[
     str | None,
     typer.Argument(metavar="[KEY]", help="A stream (map_merge/in/0, in/0) or a key expression. [the robot's own keys]"),

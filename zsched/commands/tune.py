@@ -13,11 +13,10 @@ from typing import Annotated, Any, Final
 import typer
 
 from zsched.commands.ask import ask_door
-from zsched.commands.change import OrderView, Plan, consent, tell_results
+from zsched.commands.change import CODES, OrderView, Plan, consent, status_of, tell_results
 from zsched.commands.common import CliError, Json, check_known, nearest, print_json, say, warn
-from zsched.commands.document import CODES, status_of
 from zsched.commands.options import Orders
-from zsched.commands.weight_words import NAMES, shares
+from zsched.commands.page import NAMES, shares
 from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
 from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights

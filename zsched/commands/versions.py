@@ -32,6 +32,3 @@ def version(json_: JsonOption = False) -> None:
         print_json({"schema": "zsched.version/1", **found})
     else:
         sys.stdout.write("".join(f"{name} {text}\n" for name, text in found.items()))
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

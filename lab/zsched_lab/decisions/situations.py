@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.commands.check import check as tell_rules
-from zsched.commands.watch.feed import News
-from zsched.commands.watch.past import Past
+from zsched.commands.watch.feed import News, Past
 from zsched.commands.watch.top import Frame, render_top
 from zsched.config.load import check_file
 from zsched.core import events as ev

@@ -17,11 +17,11 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands import document, fleet
+from zsched.commands import change as verbs
+from zsched.commands import fleet
 from zsched.commands.ask import PASSES_ON
-from zsched.commands.change import OrderView
+from zsched.commands.change import DOCUMENT, InForce, OrderView, in_force
 from zsched.commands.common import CliError
-from zsched.commands.document import DOCUMENT, InForce, in_force
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
@@ -65,7 +65,7 @@ class Node:
         self.meanwhile: list[tuple[str, list[str]]] = []
         self.unlearnt = 0
         """Conflicts before the node has learnt what came first."""
-        """(document, electors) of what comes first at each change."""
+        """(verbs, electors) of what comes first at each change."""
 
     def answer(self, request: Json) -> Json:
         verb, node = request["verb"], str(request.get("node") or "robot1")
@@ -316,7 +316,7 @@ def test_another_document_or_a_revision_that_was_named_is_not_overtaken(
 def test_what_does_not_come_about_has_its_exit_code(
     node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
-    monkeypatch.setattr(document, "OVERTAKEN_S", 0.2)
+    monkeypatch.setattr(verbs, "OVERTAKEN_S", 0.2)
     node.outcome = outcome
     result = run("apply", changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1"), "--yes")
     assert result.exit_code == code
@@ -528,7 +528,7 @@ def test_a_node_that_is_silent_once_the_change_is_agreed_is_waited_for(
     done = run("apply", file, "--yes")
     assert (done.exit_code, node.silent) == (0, 0), done.stderr
     assert "revision 8 is agreed" in done.stdout
-    monkeypatch.setattr(document, "IN_FORCE_S", 0.2)
+    monkeypatch.setattr(verbs, "IN_FORCE_S", 0.2)
     file.write_text(TEXT)
     node.changes, node.silent = [], 10**9
     late = run("apply", file, "--yes")
@@ -682,7 +682,7 @@ def test_an_elector_that_only_the_document_names_is_shown_and_gets_its_seat_by_w
 def test_show_does_not_take_who_may_not_be_asked_for_who_is_away(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
     """An operator's laptop asks one node of a secured fleet, and no other one through it."""
     assert node.states["edge1"] == "alive"
-    asked = document.ask_all
+    asked = verbs.ask_all
 
     def ask_some(*given: Any) -> dict[str, Any]:
         return {**asked(*given), "edge1": CliError(3, f"edge1 did not answer within 3 s; robot1 {PASSES_ON}")}

@@ -115,7 +115,7 @@ def test_a_daemon_that_tells_no_sums_gets_the_same_page(fleet: Fleet, capsys: py
 
 def test_verbs_that_only_show_load_no_values_and_no_scheduler() -> None:
     """The values alone take a quarter of the verb's time, the scheduler as long as the whole of it."""
-    verbs = "zsched.commands.status, zsched.commands.brief, zsched.commands.history, zsched.commands.explain"
+    verbs = "zsched.commands.status, zsched.commands.report, zsched.commands.history, zsched.commands.explain"
     code = f"import sys, zsched.cli, {verbs}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     heavy = ("zsched.core.values.model", "zsched.core.scheduler", "zsched.wire", "msgpack", "zenoh")

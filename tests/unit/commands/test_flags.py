@@ -18,9 +18,8 @@ from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
 from zsched.commands import flags as verbs
 from zsched.commands.ask import Door
-from zsched.commands.brief import render_brief
 from zsched.commands.change import OrderView
-from zsched.commands.report import render_status
+from zsched.commands.report import render_brief, render_status
 
 TEXT = "fleet: lab\n"
 TWO_NODES = """\

@@ -165,7 +165,7 @@ class Daemon:
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
     running = Daemon(tmp_path)
-    monkeypatch.setattr("zsched.commands.document.IN_FORCE_S", 0.2)  # its document stays the one that it has
+    monkeypatch.setattr("zsched.commands.change.IN_FORCE_S", 0.2)  # its document stays the one that it has
     with answering(running.answer, tmp_path, monkeypatch):
         yield running
 

@@ -15,10 +15,9 @@ from support.doors import STATUS, answering, living
 from support.schemas import faults
 from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
-from zsched.commands.brief import render_brief
 from zsched.commands.change import user_name
 from zsched.commands.common import CliError
-from zsched.commands.report import render_status
+from zsched.commands.report import render_brief, render_status
 from zsched.commands.tune import KEYS, tuned
 from zsched.core.values.words import CREATION_STEP
 

@@ -16,7 +16,7 @@ from support.fleets import fleet_of, node_of
 from zsched.cli import app
 from zsched.commands.apply import make_plan
 from zsched.commands.ask import Door
-from zsched.commands.document import InForce
+from zsched.commands.change import InForce
 from zsched.config.load import check_file
 from zsched.core.values.fleet import Fleet, Security
 from zsched.errors import ConfigError

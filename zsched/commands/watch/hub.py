@@ -20,8 +20,7 @@ from zsched.commands.common import Json
 from zsched.commands.explain import explanation
 from zsched.commands.metrics import down_text, metrics_text
 from zsched.commands.report import all_problems, degradations
-from zsched.commands.watch.feed import Feed
-from zsched.commands.watch.past import Past, Point
+from zsched.commands.watch.feed import Feed, Past, Point
 from zsched.guard import guarded
 
 PERIOD_S: Final = 1.0

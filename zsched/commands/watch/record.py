@@ -198,6 +198,3 @@ def _taped(path: Path, kinds: dict[str, str]) -> Iterator[Tape]:
                     writer.finish()  # type: ignore[no-untyped-call]
     except OSError as error:
         raise CliError(EXIT_FAILED, f"{path} cannot be written any more: {error.strerror}") from error
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

@@ -26,8 +26,7 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError, wants_color
 from zsched.commands.options import Asks, NoColorOption
 from zsched.commands.status import code_of
-from zsched.commands.watch.feed import Feed, News
-from zsched.commands.watch.past import Past
+from zsched.commands.watch.feed import Feed, News, Past
 from zsched.commands.watch.top import MIN_HEIGHT, MIN_WIDTH, Frame, render_top
 from zsched.core.values.struct import Struct, replace
 from zsched.exits import EXIT_USAGE
@@ -151,9 +150,6 @@ def _frame(view: TopView, first_task: int) -> Frame:
         first_task=first_task,
         period_s=max(view.interval_s, 1.0),
     )
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------
 
 
 def top(

@@ -12,11 +12,10 @@ from itertools import groupby
 from operator import itemgetter
 from typing import Final
 
-from zsched.commands.brief import task_rows
 from zsched.commands.common import Json
 from zsched.commands.page import Cell, Page, clock_time, missed_of, name_room, short_name, size, span
-from zsched.commands.report import header, millis, node_rows, per_second, troubles
-from zsched.commands.watch.past import Past, Point
+from zsched.commands.report import header, millis, node_rows, per_second, task_rows, troubles
+from zsched.commands.watch.feed import Past, Point
 from zsched.core.values.struct import Struct
 
 LEVELS: Final = "▁▂▃▄▅▆▇█"

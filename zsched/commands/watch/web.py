@@ -347,6 +347,3 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the standard library's name
         """Nothing: addresses of requests are not kept."""
-
-
-# --- on the command line ----------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.clock import wall_s
-from zsched.commands.watch.spans import trace_id
+from zsched.commands.watch.trace import trace_id
 from zsched.latch import Latch
 
 STATUS: dict[str, Any] = json.loads(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.commands.watch.spans import OVERDUE_S, Moves, Span, trace_id
+from zsched.commands.watch.trace import OVERDUE_S, Moves, Span, trace_id
 
 
 def line(at: float, stage: str, epoch: int, text: str, **more: Any) -> dict[str, Any]:

@@ -28,8 +28,7 @@ from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.watch.feed import Feed, News
-from zsched.commands.watch.past import MOST_EVENTS, MOST_MOVES, POINTS, Past
+from zsched.commands.watch.feed import MOST_EVENTS, MOST_MOVES, POINTS, Feed, News, Past
 from zsched.commands.watch.screen import LEAVE
 from zsched.commands.watch.top import LEVELS, Frame, render_top
 from zsched.errors import ConfigError
