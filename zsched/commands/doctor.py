@@ -6,7 +6,6 @@ Knows: how results are shown, exit codes. Does not know: any check (`zsched.doct
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 import textwrap
 from collections import Counter
@@ -21,7 +20,7 @@ from zsched.commands.ask import name_here
 from zsched.commands.common import Json, print_json, wants_color
 from zsched.commands.options import JsonOption, NoColorOption
 from zsched.commands.options import Machine as Here
-from zsched.commands.page import Page
+from zsched.commands.page import Page, page_width
 from zsched.doctor.look import Machine, look
 from zsched.doctor.model import Check, Result, Scene, Verdict
 from zsched.doctor.table import run_all, worst
@@ -32,7 +31,6 @@ SCHEMA: Final = "zsched.doctor/1"
 STYLES: Final = {Verdict.PASS: "green", Verdict.SKIP: "dim", Verdict.WARN: "yellow", Verdict.FAIL: "alarm"}
 NAME_COLUMNS: Final = 22
 INDENT: Final = 5
-MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 Results = list[tuple[Check, Result]]
 
 
@@ -67,8 +65,7 @@ def doctor(
     if json_:
         print_json(as_json(scene, results))
     else:
-        width = max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))
-        sys.stdout.write(as_text(results, width, is_colored=wants_color(no_color)))
+        sys.stdout.write(as_text(results, page_width(), is_colored=wants_color(no_color)))
     bad = (Verdict.FAIL, Verdict.WARN) if strict else (Verdict.FAIL,)
     return EXIT_FAILED if worst(results) in bad else EXIT_OK
 

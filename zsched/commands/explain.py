@@ -9,7 +9,6 @@ Knows: which daemon to ask, the text, the schema ``zsched.explain/1``. Does not 
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -22,7 +21,7 @@ from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, wants_color, warn
 from zsched.commands.history import is_known, is_move, wall_text, when_of, where_of
 from zsched.commands.options import Answers, NoColorOption
-from zsched.commands.page import Cell, Page, age_s_of, memory, name_room, shares, short_name, span
+from zsched.commands.page import Cell, Page, age_s_of, memory, name_room, page_width, shares, short_name, span
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.veto import Filter
 from zsched.core.values.words import PAPER_METRICS, meant, shown
@@ -31,7 +30,6 @@ from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 SCHEMA = "zsched.explain/1"
 MAX_DIGITS = 16
 """Of an epoch (`zsched.core.values.model.MAX_COUNTER`)."""
-MIN_WIDTH, MAX_WIDTH = 60, 160
 COLUMNS = {"memory": "mem", "network": "net"}
 """The short titles of columns."""
 OUTCOMES = {"stay": "green", "none": "red"}
@@ -86,8 +84,7 @@ def explain(
     if asked.json_:
         print_json(body)
     else:
-        width = max(MIN_WIDTH, min(shutil.get_terminal_size((100, 30)).columns, MAX_WIDTH))
-        sys.stdout.write(render(body, width, wants_color(no_color)))
+        sys.stdout.write(render(body, page_width(), wants_color(no_color)))
     return code
 
 

@@ -74,49 +74,34 @@ LAST: Final = "last-node"
 NOT_TOLD: Final = "not-told"
 """The danger: the others cannot be told, and count this node until somebody has them forget it."""
 DANGERS: Final = (NO_OTHER, LAST, NOT_TOLD, HOLDS_AUTHORITY)
-PAUSE_S: Final = 0.2
 STOP_S: Final = 20.0
 """How long a daemon may take to end: it hands over, and stops its workers and its relay."""
 LEARN_S: Final = 10.0
 """How long the other nodes may take to learn that this one is gone."""
 
 
-class LeaveOrder(Struct, frozen=True, kw_only=True):
-    """What the operator has said."""
+class Way(Struct, frozen=True, kw_only=True):
+    """One node on its way out, and what the operator has said."""
 
     places: Places
     is_purged: bool
     deadline_s: float
     view: OrderView
     """Without a door until the daemon is found."""
-
-    @property
-    def is_json(self) -> bool:
-        """Whether programs read it."""
-        return self.view.is_json
-
-    @property
-    def is_plan(self) -> bool:
-        """Whether it is only shown."""
-        return self.view.is_plan
-
-
-class Way(Struct, frozen=True, kw_only=True):
-    """One node on its way out."""
-
-    order: LeaveOrder
+    fleet: str
     me: str
     began: float
     files: tuple[Written, ...]
+    """Of this machine, with what becomes of them."""
 
     @property
     def door(self) -> Door:
         """To its daemon."""
-        return self.order.view.door
+        return self.view.door
 
     def tell(self, text: str) -> None:
         """A step that is done, for people; programs read the events and the end."""
-        if not self.order.is_json:
+        if not self.view.is_json:
             say(text)
 
     def until(self, look: Callable[[], Iterable[str]], still: str = "") -> None:
@@ -126,7 +111,7 @@ class Way(Struct, frozen=True, kw_only=True):
             OverError: the leave was taken back.
             CliError: the deadline has come (5).
         """
-        left_s = self.order.deadline_s - (monotonic_s() - self.began)
+        left_s = self.deadline_s - (monotonic_s() - self.began)
         for lack in until(look, left_s)[:1]:
             advice = f"give `{again()}` again to go on, or take it back: zsched undrain {self.me}"
             took = span(monotonic_s() - self.began)
@@ -167,36 +152,48 @@ def leave(
         accepted=accepted,
         is_lines=True,
     )
-    order = LeaveOrder(places=here.places(), is_purged=purge, deadline_s=duration_s(deadline), view=view)
-    fleet, me = whose(order.places.state)
-    files = belongings(order.places, is_purged=order.is_purged)
+    places = here.places()
+    fleet, me = whose(places.state)
+    way = Way(
+        places=places,
+        is_purged=purge,
+        deadline_s=duration_s(deadline),
+        view=view,
+        fleet=fleet,
+        me=me,
+        began=monotonic_s(),
+        files=belongings(places, is_purged=purge),
+    )
     try:
         door = own_door(runtime_dir, me)
         status = ask_door(door, {"verb": "status"})
     except CliError as error:
         if error.code != EXIT_UNREACHABLE:
             raise
-        rows: tuple[Row, ...] = ()
-        if not is_out(fleet, me, order.places.state):
-            told = f"{error}. The others are not told: `zsched node forget {me}` tells them"
-            accept_all(order, (NOT_TOLD, told), *authority_danger(order, fleet))
-            rows = ((me, "member", fleet, NOTHING),)
-        else:
-            if not order.is_json:
-                say(f"{me} is no node of {fleet} any more, and its daemon has ended")
-            _warn(order, authority_danger(order, fleet))  # it has happened: there is nothing to accept
-        code = _asked(order, fleet, me, files, rows)
-        return _end(order, fleet, me) if code is None else code
+        return _without_daemon(way, error)
     if (status["fleet"], status["node"]) != (fleet, me):
         other = f"{status['node']} of fleet {status['fleet']}"
-        raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {order.places.state} is {me}'s; give --state-dir")
-    order = replace(order, view=replace(view, door=door))
-    way = Way(order=order, me=me, began=monotonic_s(), files=files)
+        raise CliError(EXIT_USAGE, f"the daemon here is {other}, and {places.state} is {me}'s; give --state-dir")
+    way = replace(way, view=replace(view, door=door))
     code = _take_leave(way, status)
     if code != EXIT_OK:
         return code
-    stop_daemon(way, fleet, f"{me} has left {fleet}")
-    return _end(order, fleet, me, is_last=[str(one["name"]) for one in status["nodes"]] == [me])
+    stop_daemon(way, f"{me} has left {fleet}")
+    return _end(way, is_last=[str(one["name"]) for one in status["nodes"]] == [me])
+
+
+def _without_daemon(way: Way, error: CliError) -> int:
+    """Put the files away where no daemon runs, which the others may not know; the exit code."""
+    rows: tuple[Row, ...] = ()
+    if not is_out(way.fleet, way.me, way.places.state):
+        told = f"{error}. The others are not told: `zsched node forget {way.me}` tells them"
+        accept_all(way, (NOT_TOLD, told), *authority_danger(way))
+        rows = ((way.me, "member", way.fleet, NOTHING),)
+    else:
+        way.tell(f"{way.me} is no node of {way.fleet} any more, and its daemon has ended")
+        _warn(way, authority_danger(way))  # it has happened: there is nothing to accept
+    code = _asked(way, rows)
+    return _end(way) if code is None else code
 
 
 def own_door(runtime_dir: Path | None, me: str) -> Door:
@@ -211,7 +208,7 @@ def own_door(runtime_dir: Path | None, me: str) -> Door:
     return door
 
 
-def _asked(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], rows: tuple[Row, ...]) -> int | None:
+def _asked(way: Way, rows: tuple[Row, ...]) -> int | None:
     """Show what becomes of this machine, and ask, where no drain does so; the exit code when nothing is to be done now.
 
     ``rows``: what is lost beside the files.
@@ -219,11 +216,11 @@ def _asked(order: LeaveOrder, fleet: str, me: str, files: tuple[Written, ...], r
     Raises:
         CliError: off a terminal, without --yes.
     """
-    if order.is_plan:
-        for line in lined(TITLES, rows) if not order.is_json else ():
+    if way.view.is_plan:
+        for line in lined(TITLES, rows) if not way.view.is_json else ():
             say(line)
-        return _told(order, fleet, me, files)
-    return consent(order.view, Plan(rows=(*rows, *map(_file_row, files)), body={}, titles=TITLES))
+        return _planned(way)
+    return consent(way.view, Plan(rows=(*rows, *map(_file_row, way.files)), body={}, titles=TITLES))
 
 
 def _file_row(one: Written) -> Row:
@@ -231,30 +228,30 @@ def _file_row(one: Written) -> Row:
     return str(one.path), "file", what, fate
 
 
-def accept_all(order: LeaveOrder, *dangers: tuple[str, str]) -> None:
+def accept_all(way: Way, *dangers: tuple[str, str]) -> None:
     """Go on only if each danger is accepted by its name; each is a name and what it means.
 
     Raises:
         CliError: one is not.
     """
-    if not order.is_plan:
-        check_taken(dangers, order.view.accepted)
-    _warn(order, dangers)
+    if not way.view.is_plan:
+        check_taken(dangers, way.view.accepted)
+    _warn(way, dangers)
 
 
-def _warn(order: LeaveOrder, dangers: tuple[tuple[str, str], ...]) -> None:
-    if not order.is_json:
+def _warn(way: Way, dangers: tuple[tuple[str, str], ...]) -> None:
+    if not way.view.is_json:
         for name, means in dangers:
             warn(f"{name}: {means}")
 
 
-def authority_danger(order: LeaveOrder, fleet: str, text: str = "") -> tuple[tuple[str, str], ...]:
+def authority_danger(way: Way, text: str = "") -> tuple[tuple[str, str], ...]:
     """The danger that nobody renews the certificates of a fleet that goes on; empty: there is none.
 
     ``text``: its document.
     """
-    folder = authority_here(fleet, order.places.config, text)
-    return () if folder is None else ((HOLDS_AUTHORITY, left_behind(folder, fleet)),)
+    folder = authority_here(way.fleet, way.places.config, text)
+    return () if folder is None else ((HOLDS_AUTHORITY, left_behind(folder, way.fleet)),)
 
 
 # --- while the daemon runs -------------------------------------------------------------------------------------------
@@ -262,55 +259,55 @@ def authority_danger(order: LeaveOrder, fleet: str, text: str = "") -> tuple[tup
 
 def _take_leave(way: Way, status: Json) -> int:
     """Have the fleet agree, step by step; the exit code."""
-    order, me = way.order, way.me
+    me = way.me
     if of_kind(status, Problem.TAKEN_OUT):  # the others may not answer it any more
         way.tell(f"{me} is no node of {status['fleet']} any more: it was taken out")
-        return _go_alone(way, str(status["fleet"]), int(status["fleet_revision"]) + 1)
+        return _go_alone(way, int(status["fleet_revision"]) + 1)
     held = _newest(way, status)
     members = members_of(held, status)
     danger = _danger(way, status, held, members)
     if danger is not None:
-        more = () if danger[0] == LAST else authority_danger(order, held.fleet, held.text)
-        accept_all(order, danger, *more)
-        return _go_alone(way, held.fleet, None)
+        more = () if danger[0] == LAST else authority_danger(way, held.text)
+        accept_all(way, danger, *more)
+        return _go_alone(way, None)
     if me not in members:
         way.tell(f"{me} is no node of {held.fleet} since revision {held.revision}")
-        return _go_alone(way, held.fleet, held.revision)
+        return _go_alone(way, held.revision)
     without(document_text(held), me)  # its faults come before anything is done
-    accept_all(order, *authority_danger(order, held.fleet, held.text))
+    accept_all(way, *authority_danger(way, held.text))
     rows: tuple[Row, ...] = ((me, "member", held.fleet, "-"),)
     if any(name == me for name, _ in held.electors):
         rows = (*rows, (me, "elector", ", ".join(name for name, _ in held.electors), others_of(held, me)))
-    drained = DrainOrder(nodes=(me,), kind=LEAVE, deadline_s=order.deadline_s, more_rows=rows)
-    ours = tuple(name for name in order.view.accepted if name == NO_OTHER)
-    code = drain_nodes(replace(order.view, accepted=ours), drained, status)
-    if order.is_plan and code == EXIT_WOULD_CHANGE:
-        return _told(order, held.fleet, me, way.files)
-    if order.is_plan or code != EXIT_OK:
-        return EXIT_WOULD_CHANGE if order.is_plan and code == EXIT_OK else code
-    _note(way, held.fleet, _go_out(way, held.fleet, give_up_the_seat(way)))
+    drained = DrainOrder(nodes=(me,), kind=LEAVE, deadline_s=way.deadline_s, more_rows=rows)
+    ours = tuple(name for name in way.view.accepted if name == NO_OTHER)
+    code = drain_nodes(replace(way.view, accepted=ours), drained, status)
+    if way.view.is_plan and code == EXIT_WOULD_CHANGE:
+        return _planned(way)
+    if way.view.is_plan or code != EXIT_OK:
+        return EXIT_WOULD_CHANGE if way.view.is_plan and code == EXIT_OK else code
+    _note(way, _go_out(way, give_up_the_seat(way)))
     return EXIT_OK
 
 
-def _go_alone(way: Way, fleet: str, out: int | None) -> int:
+def _go_alone(way: Way, out: int | None) -> int:
     """Where the others agree nothing: ask, and note that they are without this node; the exit code.
 
     ``out``: the revision from which on they are; ``None``: they are not.
     """
     me = way.me
     if out is not None:
-        _warn(way.order, authority_danger(way.order, fleet))
-    rows: tuple[Row, ...] = () if out is not None else ((me, "member", fleet, NOTHING),)
-    code = _asked(way.order, fleet, me, way.files, (*rows, (me, "daemon", "runs", "ended")))
+        _warn(way, authority_danger(way))
+    rows: tuple[Row, ...] = () if out is not None else ((me, "member", way.fleet, NOTHING),)
+    code = _asked(way, (*rows, (me, "daemon", "runs", "ended")))
     if code is None and out is not None:
-        _note(way, fleet, out)
+        _note(way, out)
     return EXIT_OK if code is None else code
 
 
-def _note(way: Way, fleet: str, revision: int) -> None:
+def _note(way: Way, revision: int) -> None:
     """Keep that the fleet is without this node, so that the command goes on when it is broken off after the daemon."""
     with contextlib.suppress(AdapterError):  # a full disk keeps nobody from leaving
-        note_out(fleet, way.me, revision, way.order.places.state)
+        note_out(way.fleet, way.me, revision, way.places.state)
 
 
 def others_of(held: InForce, me: str) -> str:
@@ -353,7 +350,7 @@ def _danger(way: Way, status: Json, held: InForce, members: tuple[str, ...]) -> 
         return None
     if not held.document:
         told = f"{held.fleet} goes by the file on each machine: take {me} out of it there, or agree a document first"
-        return NOT_TOLD, f"{told} (zsched apply {way.order.places.config})"
+        return NOT_TOLD, f"{told} (zsched apply {way.places.config})"
     if not quorum["ok"]:
         told = f"{quorum['alive']} of {quorum['electors']} electors can answer, {quorum['needed']} needed"
         return NOT_TOLD, f"{told}. The others are not told: `zsched node forget {me}` tells them"
@@ -419,7 +416,7 @@ def _ask_for_the_seat(way: Way, held: InForce) -> str:
     return "it is removed"
 
 
-def _go_out(way: Way, fleet: str, since: int) -> int:
+def _go_out(way: Way, since: int) -> int:
     """Have this node taken out of the document, and wait until the others know; the revision without it.
 
     One of them proposes it: this node would not store a document that does not name it.
@@ -438,7 +435,7 @@ def _go_out(way: Way, fleet: str, since: int) -> int:
         return []
 
     way.until(look)
-    way.tell(f"{fleet}: revision {revision} is agreed, and {way.me} is no node of it")
+    way.tell(f"{way.fleet}: revision {revision} is agreed, and {way.me} is no node of it")
     _wait_until_known(way, revision)
     return revision
 
@@ -495,13 +492,13 @@ def _knows(answer: Json | CliError, revision: int) -> bool:
 
 
 def _ordered(way: Way) -> Json:
-    return ordered("leave", way.order.view.asked)
+    return ordered("leave", way.view.asked)
 
 
 # --- the end ---------------------------------------------------------------------------------------------------------
 
 
-def stop_daemon(way: Way, fleet: str, done: str) -> None:
+def stop_daemon(way: Way, done: str) -> None:
     """End the daemon, and wait until it has given its state folder back; ``done``: what has been done so far.
 
     Raises:
@@ -511,7 +508,7 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
 
     def look() -> list[str]:
         try:
-            check_ended(fleet, way.me, way.order.places)
+            check_ended(way.fleet, way.me, way.places)
         except AdapterError as error:
             return [str(error)]
         return []
@@ -522,30 +519,25 @@ def stop_daemon(way: Way, fleet: str, done: str) -> None:
     way.tell(f"{way.me}: the daemon has ended")
 
 
-def _end(order: LeaveOrder, fleet: str, me: str, *, is_last: bool = False) -> int:
+def _end(way: Way, *, is_last: bool = False) -> int:
     """Put the files away; ``is_last``: the fleet had no other node."""
-    folder = None if is_last else authority_here(fleet, order.places.config)
-    done = put_away(fleet, me, order.places, is_purged=order.is_purged)
+    fleet, me = way.fleet, way.me
+    folder = None if is_last else authority_here(fleet, way.places.config)
+    done = put_away(fleet, me, way.places, is_purged=way.is_purged)
     back = f"it comes back by `zsched invite {me}` on another node"
     if is_last:
         back = f"{fleet} has no node any more; `zsched fleet create NAME` makes a new fleet"
-    advice = (back,) if folder is None else (bring_advice(folder, fleet), back)
-    return _told(order, fleet, me, done, "left", f"{me} has left {fleet}", advice)
+    service = "sudo systemctl disable zsched: it would find no fleet at the next boot"
+    advice = (
+        *((service,) if way.places.config == paths.SYSTEM_CONFIG else ()),
+        *(() if folder is None else (bring_advice(folder, fleet),)),
+        back,
+    )
+    told = Told(fleet=fleet, node=me, outcome="left", said=f"{me} has left {fleet}", files=done, next=advice)
+    return told.tell(is_json=way.view.is_json, is_line=True)
 
 
-def _told(
-    order: LeaveOrder,
-    fleet: str,
-    me: str,
-    files: tuple[Written, ...],
-    outcome: str = "planned",
-    said: str = "",
-    advice: tuple[str, ...] = (),
-) -> int:
-    """The end of it, or its plan; ``advice``: what is to be done then. The exit code."""
-    is_service = order.places.config == paths.SYSTEM_CONFIG
-    service = ("sudo systemctl disable zsched: it would find no fleet at the next boot",) if is_service else ()
-    more = () if order.is_plan else (*service, *advice)
-    text = said or f"{me} would leave {fleet}"
-    told = Told(fleet=fleet, node=me, outcome=outcome, said=text, files=files, next=more)
-    return told.tell(is_json=order.is_json, is_line=True)
+def _planned(way: Way) -> int:
+    said = f"{way.me} would leave {way.fleet}"
+    told = Told(fleet=way.fleet, node=way.me, outcome="planned", said=said, files=way.files)
+    return told.tell(is_json=way.view.is_json, is_line=True)

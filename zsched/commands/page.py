@@ -6,6 +6,7 @@ Knows: columns, cutting, ANSI styles, how figures and moments are written. Does 
 from __future__ import annotations
 
 import re
+import shutil
 import textwrap
 import time
 from typing import Any, Final, TypeAlias
@@ -25,6 +26,11 @@ NAME_ROOM: Final = 20
 
 Cell: TypeAlias = tuple[str, str]
 """A text and its style ("" for none)."""
+
+
+def page_width() -> int:
+    """Columns of the terminal, as far as a page uses them."""
+    return max(60, min(shutil.get_terminal_size((100, 30)).columns, 160))
 
 
 class Page:

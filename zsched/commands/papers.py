@@ -17,29 +17,21 @@ from typing import TYPE_CHECKING, Final
 from zsched import paths as places
 from zsched.commands.apply import DANGERS, OPEN_NETWORK
 from zsched.commands.common import CliError, check_dangers, check_name, warn
-from zsched.commands.pki import (
-    begin_for,
-    former_keys,
-    is_left_of,
-    issue_for,
-    passphrase_for,
-    supersede,
-)
+from zsched.commands.pki import held_here, hosts_of, new_secret, now_here, passphrase_of, read_request
 from zsched.commands.renewing import holds_authority, renew_advice
+from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_FAILED, EXIT_USAGE
-from zsched.files import read_regular
 from zsched.runtime.membership import Places, Written, request_here
 from zsched.runtime.own_addresses import addresses_at
 from zsched.runtime.unfinished import mark_of
 from zsched.wire.invitation import Papers
 
 if TYPE_CHECKING:
-    from zsched.commands.pki import Begun  # holds what imports cryptography
+    from zsched.pki.authority import Authority, Issued  # imports cryptography
 
-MAX_REQUEST: Final = 1 << 20
 FIRST_KEY: Final = "ca-1.key"
 """Of a new authority."""
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104 - compared with
@@ -51,7 +43,8 @@ class FirstPapers:
     def __init__(self, fleet: str, node: NodeId, authority: Path | None, *, asks_passphrase: bool) -> None:
         """``authority``: its folder; ``None``: where `zsched pki` looks."""
         self._node, self._authority, self._asks = node, authority, asks_passphrase
-        self._begun: Begun | None = None
+        self._made: Authority | None = None
+        self._is_locked = False
         self._fleet, self._folder = fleet, places.authority_folder(authority, os.environ, fleet)
 
     def check(self, creation: str = "") -> None:
@@ -60,10 +53,24 @@ class FirstPapers:
         Raises:
             CliError: there is one.
         """
-        is_left = is_left_of(creation, self._fleet, self._node, self._authority)
-        if not is_left and holds_authority(self._fleet, self._authority) is not None:
+        if not self._is_left_of(creation) and holds_authority(self._fleet, self._authority) is not None:
             advice = "if no fleet needs it any more, move it away; another folder: --authority DIR"
             raise CliError(EXIT_FAILED, f"{self._folder} holds an authority, and is left as it is; {advice}")
+
+    def _is_left_of(self, creation: str, *, is_destroyed: bool = False) -> bool:
+        """Whether the authority here was made by this creation, and nobody but its first node has got anything.
+
+        ``is_destroyed``: it is deleted then.
+        """
+        with suppress(AdapterError, OSError), held_here(self._fleet, self._authority) as authority:
+            if authority is None or not creation:
+                return False
+            record = authority.record
+            is_left = record.creation == creation and all(one.holder.name == self._node for one in record.entries)
+            if is_left and is_destroyed:
+                authority.destroy()
+            return is_left
+        return False
 
     def certify(self, fleet: Fleet, creation: str) -> Papers:
         """The certificate and key of the first node; what an earlier try of this creation has left is deleted.
@@ -72,20 +79,21 @@ class FirstPapers:
             CliError: there is an authority already.
             AdapterError: its folder cannot be written.
         """
-        is_left_of(creation, self._fleet, self._node, self._authority, is_destroyed=True)
+        self._is_left_of(creation, is_destroyed=True)
         self.check()
-        begun = self._begun = begin_for(
-            fleet, self._node, self._authority, asks_passphrase=self._asks, creation=creation
-        )
-        issued = begun.issued
-        certificate, key, trusted = (pem.decode("ascii") for pem in (issued.certificate, issued.key, issued.trusted))
-        return Papers(certificate=certificate, key=key, trusted=trusted)
+        from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
+
+        secret = new_secret(is_wanted=self._asks)
+        self._is_locked = bool(secret)
+        self._made = create(self._folder, fleet.name, secret, now_here(), creation)
+        hosts = hosts_of(fleet, self._node, Role.NODE)
+        return _papers(self._made.issue(self._node, Role.NODE, hosts, b"", secret, now_here()))
 
     def destroy(self, config: Path) -> None:
         """The fleet was not founded: nobody has a certificate of its authority, so it goes, and then the mark."""
-        if self._begun is not None:
+        if self._made is not None:
             with suppress(OSError):
-                self._begun.authority.destroy()
+                self._made.destroy()
                 mark_of(config).unlink(missing_ok=True)
 
     @property
@@ -97,13 +105,12 @@ class FirstPapers:
     @property
     def advice(self) -> tuple[str, ...]:
         """How the key goes offline, and how certificates are renewed."""
-        is_locked = self._begun is not None and self._begun.is_locked
-        lock = "" if is_locked else ", not locked (--passphrase does that)"
+        lock = "" if self._is_locked else ", not locked (--passphrase does that)"
         said = f"the authority's key lies on this machine{lock}; no daemon needs it"
         how = (
             f"move the folder {self._folder} to a stick, and name it to `zsched invite` and `zsched pki` by --authority"
         )
-        return f"{said}. To take it offline, {how}", renew_advice(self._folder, self._fleet, is_locked=is_locked)
+        return f"{said}. To take it offline, {how}", renew_advice(self._folder, self._fleet, is_locked=self._is_locked)
 
 
 def key_to_papers(fleet: Fleet, authority: Path | None) -> bytes:
@@ -113,7 +120,13 @@ def key_to_papers(fleet: Fleet, authority: Path | None) -> bytes:
         CliError: nobody types it.
         AdapterError: it is wrong, or the authority cannot be used.
     """
-    return b"" if fleet.security is None else passphrase_for(fleet, authority) or b""
+    if fleet.security is None:
+        return b""
+    with held_here(fleet.name, authority) as held:
+        secret = b"" if held is None else passphrase_of(held)
+        if held is not None:
+            held.check(secret)
+        return secret
 
 
 def keys_to_revoke(fleet: Fleet, node: NodeId, authority: Path | None, request: Path | None) -> tuple[str, ...]:
@@ -127,7 +140,11 @@ def keys_to_revoke(fleet: Fleet, node: NodeId, authority: Path | None, request: 
     """
     if fleet.security is None:
         return ()
-    return former_keys(fleet, node, authority, b"" if request is None else read_request(request))
+    asked = read_request(request)
+    with held_here(fleet.name, authority) as held:
+        entries = () if held is None else held.record.entries
+        own = [one for one in entries if (one.holder.name, one.holder.role) == (node, Role.NODE)]
+        return tuple(one.label for one in own if held is None or not held.asks_for(one, asked))
 
 
 def papers_for(
@@ -142,12 +159,19 @@ def papers_for(
     """
     if fleet.security is None:
         return None
-    supersede(fleet, keys_to_revoke(fleet, node, authority, request), authority)
-    issued = issue_for(fleet, node, authority, secret, b"" if request is None else read_request(request))
-    if issued is None:
-        advice = f"where it is: zsched pki issue {node}; bring its files to the machine before it starts"
-        warn(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}")
-        return None
+    former = keys_to_revoke(fleet, node, authority, request)
+    with held_here(fleet.name, authority) as held:
+        if held is not None:
+            for label in former:
+                held.revoke(label, now_here())
+            hosts = hosts_of(fleet, node, Role.NODE)
+            return _papers(held.issue(node, Role.NODE, hosts, read_request(request), secret, now_here()))
+    advice = f"where it is: zsched pki issue {node}; bring its files to the machine before it starts"
+    warn(f"the invitation has no certificate: the fleet's authority is not on this machine; {advice}")
+    return None
+
+
+def _papers(issued: Issued) -> Papers:
     certificate, key, trusted = (pem.decode("ascii") for pem in (issued.certificate, issued.key, issued.trusted))
     return Papers(certificate=certificate, key=key, trusted=trusted)
 
@@ -172,18 +196,6 @@ def check_request(fleet: Fleet, request: Path | None, authority: Path | None) ->
         requested_key(read_request(request))
     except ValueError as error:
         raise AdapterError(f"{request}: {error}; make it anew: zsched join --request NAME") from error
-
-
-def read_request(path: Path) -> bytes:
-    """A certificate request in a file.
-
-    Raises:
-        AdapterError: it cannot be read.
-    """
-    try:
-        return read_regular(path, MAX_REQUEST) or b"-"
-    except OSError as error:
-        raise AdapterError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def ask_for_certificate(name: str, where: Places, out: Path | None) -> tuple[Written, ...]:

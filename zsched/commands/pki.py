@@ -10,7 +10,7 @@ import contextlib
 import getpass
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -114,8 +114,8 @@ def init(
         advice = f"if that is lost for good (docs/guide/secure.md): --accept {SECOND}"
         said = f"a second authority makes certificates by which nobody is let in; {advice}"
         raise CliError(EXIT_FAILED, f"{_elsewhere(office.fleet, trusted)}; {said}")
-    secret = _new_passphrase() if passphrase else os.environ.get(PASSPHRASE, "").encode()
-    authority = create(office.folder, office.fleet.name, secret, _now())
+    secret = new_secret(is_wanted=passphrase)
+    authority = create(office.folder, office.fleet.name, secret, now_here())
     lock = "locked with the passphrase" if secret else "not locked: --passphrase does that"
     first = office.fleet.nodes[0].name
     _say(
@@ -145,41 +145,17 @@ def issue(
     """
     with _opened(where) as (office, authority):
         check_trusted(office.fleet, authority)
-        hosts = _check_name(office.fleet, name, role)
-        asked, now = _request(csr), _now()
+        hosts = hosts_of(office.fleet, name, role)
+        asked, now = read_request(csr), now_here()
         holder = authority.next_holder(name, role, asked, now)
         folder = out or Path(holder.label)
         _check_free(folder, office.fleet.name, holder, makes_key=csr is None)
-        issued = authority.issue(name, role, hosts, asked, _passphrase(authority), now)
+        issued = authority.issue(name, role, hosts, asked, passphrase_of(authority), now)
         _write(folder, issued)
     files = f"{CERTIFICATE}, {TRUSTED}" + (f", {KEY}" if issued.key else "")
     _say(f"{folder}: {files} of {issued.entry.label}, until {_day(issued.entry)}")
     _say(_how_to_install(folder, role, has_key=bool(issued.key)), _lacking(office.fleet, name, role))
     return EXIT_OK
-
-
-class Begun(Struct, frozen=True, kw_only=True):
-    """A new authority, and the certificate of its first node."""
-
-    authority: Authority
-    issued: Issued
-    is_locked: bool
-    """Whether its key needs a passphrase."""
-
-
-def begin_for(fleet: Fleet, node: str, given: Path | None, *, asks_passphrase: bool, creation: str) -> Begun:
-    """A new authority for a new fleet, and the first node's certificate with a new key; ``creation``: of that fleet.
-
-    Raises:
-        AdapterError: there is an authority already, or the folder cannot be written.
-    """
-    from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
-
-    folder = places.authority_folder(given, os.environ, fleet.name)
-    secret = _new_passphrase() if asks_passphrase else os.environ.get(PASSPHRASE, "").encode()
-    authority = create(folder, fleet.name, secret, _now(), creation)
-    issued = authority.issue(node, Role.NODE, _check_name(fleet, node, Role.NODE), b"", secret, _now())
-    return Begun(authority=authority, issued=issued, is_locked=bool(secret))
 
 
 class Known(Struct, frozen=True, kw_only=True):
@@ -190,110 +166,35 @@ class Known(Struct, frozen=True, kw_only=True):
     """Nodes that have a certificate, and are not in the fleet file here."""
 
 
+@contextlib.contextmanager
+def held_here(fleet: str, given: Path | None) -> Iterator[Authority | None]:
+    """The authority of a fleet on this machine; ``None``: there is none.
+
+    Raises:
+        AdapterError: it cannot be used.
+    """
+    folder = holds_authority(fleet, given)
+    if folder is None:
+        yield None
+        return
+    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
+
+    with opened(folder, fleet) as authority:
+        yield authority
+
+
 def known_here(fleet: Fleet) -> Known | None:
     """What the authority here tells of a fleet that had a state; ``None``: there is none, or it tells of none.
 
     `zsched fleet create` makes it together with a state, and by hand it is made before any state.
     """
-    folder = None if fleet.security is None else holds_authority(fleet.name, None)
-    if folder is None:
-        return None
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    with contextlib.suppress(AdapterError, OSError), opened(folder, fleet.name) as authority:
-        record, named = authority.record, {node.name for node in fleet.nodes}
-        live = {one.holder.name for one in record.entries if one.revoked is None and one.holder.role is Role.NODE}
-        others = tuple(sorted(live - named))
-        return Known(folder=folder, others=others) if record.creation or others else None
+    with contextlib.suppress(AdapterError, OSError), held_here(fleet.name, None) as authority:
+        if authority is not None and fleet.security is not None:
+            record, named = authority.record, {node.name for node in fleet.nodes}
+            live = {one.holder.name for one in record.entries if one.revoked is None and one.holder.role is Role.NODE}
+            others = tuple(sorted(live - named))
+            return Known(folder=authority.folder, others=others) if record.creation or others else None
     return None
-
-
-def is_left_of(creation: str, fleet: str, node: str, given: Path | None, *, is_destroyed: bool = False) -> bool:
-    """Whether the authority here was made by this creation of a fleet, and nobody but its first node has got anything.
-
-    ``is_destroyed``: it is deleted then.
-    """
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    folder = holds_authority(fleet, given)
-    if folder is None or not creation:
-        return False
-    with contextlib.suppress(AdapterError, OSError), opened(folder, fleet) as authority:
-        record = authority.record
-        is_left = record.creation == creation and all(one.holder.name == node for one in record.entries)
-        if is_left and is_destroyed:
-            authority.destroy()
-        return is_left
-    return False
-
-
-def passphrase_for(fleet: Fleet, given: Path | None) -> bytes | None:
-    """What opens the key of a fleet's authority on this machine (empty: it is not locked); ``None``: there is none.
-
-    Raises:
-        CliError: nobody types it.
-        AdapterError: it is wrong, or the authority cannot be used.
-    """
-    folder = holds_authority(fleet.name, given)
-    if folder is None:
-        return None
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    with opened(folder, fleet.name) as authority:
-        secret = _passphrase(authority)
-        authority.check(secret)
-    return secret
-
-
-def former_keys(fleet: Fleet, node: str, given: Path | None, request: bytes = b"") -> tuple[str, ...]:
-    """The labels of all keys that a node has had, less the one that ``request`` is for.
-
-    Raises:
-        AdapterError: the authority or the request cannot be used.
-    """
-    folder = holds_authority(fleet.name, given)
-    if folder is None:
-        return ()
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    with opened(folder, fleet.name) as authority:
-        own = [one for one in authority.record.entries if (one.holder.name, one.holder.role) == (node, Role.NODE)]
-        return tuple(one.label for one in own if not authority.asks_for(one, request))
-
-
-def supersede(fleet: Fleet, labels: Sequence[str], given: Path | None) -> None:
-    """Revoke keys that others take the place of.
-
-    Raises:
-        AdapterError: the authority cannot be used.
-    """
-    folder = holds_authority(fleet.name, given)
-    if folder is None or not labels:
-        return
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    with opened(folder, fleet.name) as authority:
-        for label in labels:
-            authority.revoke(label, _now())
-
-
-def issue_for(fleet: Fleet, node: str, given: Path | None, secret: bytes, request: bytes = b"") -> Issued | None:
-    """The first certificate of a node; ``None``: this machine holds no authority of the fleet.
-
-    ``secret`` opens its key (`passphrase_for`).
-    ``request``: a certificate request (PEM) for a key that was made elsewhere; without it there is a new key.
-
-    Raises:
-        AdapterError: the node has a certificate already, or the authority cannot be used.
-    """
-    folder = holds_authority(fleet.name, given)
-    if folder is None:
-        return None
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    hosts = _check_name(fleet, node, Role.NODE)
-    with opened(folder, fleet.name) as authority:
-        return authority.issue(node, Role.NODE, hosts, request, secret, _now())
 
 
 def renew(
@@ -318,8 +219,8 @@ def renew(
     if name is None and (csr is not None or out is not None):
         raise CliError(EXIT_USAGE, "--csr and --out go with a NAME")
     with _opened(where) as (office, authority):
-        secret = _passphrase(authority)
-        now = int(_now().timestamp())
+        secret = passphrase_of(authority)
+        now = int(now_here().timestamp())
         live = [one for one in authority.record.entries if one.revoked is None]
         labels = [one.label for one in live if one.is_due(now, authority.record.number)] if name is None else [name]
         hosts = {node.name: (node.host,) if node.host else () for node in office.fleet.nodes}
@@ -328,7 +229,7 @@ def renew(
             if holder is not None:
                 _check_free(folder, office.fleet.name, holder, makes_key=False)
             named = hosts.get(holder.name) if holder is not None and holder.role is Role.NODE else None
-            issued = authority.renew(one, named, _request(csr), secret, _now())
+            issued = authority.renew(one, named, read_request(csr), secret, now_here())
             _write(folder, issued)
             _say(f"{folder}: {CERTIFICATE}, {TRUSTED} of {one}, until {_day(issued.entry)}")
     if labels:
@@ -356,7 +257,7 @@ def _deliver(where: Where, door: Door, label: str | None) -> int:
     with _opened(where) as (_, authority):
         _check_fleet(status, authority)
         _see_anew(door, authority, members)
-        now, number = int(_now().timestamp()), authority.record.number
+        now, number = int(now_here().timestamp()), authority.record.number
         live = [one for one in authority.record.entries if one.revoked is None and one.holder.role is Role.NODE]
         named = [one for one in live if label in (None, one.label)]
         if not named and label is not None:
@@ -371,9 +272,9 @@ def _deliver(where: Where, door: Door, label: str | None) -> int:
             told = f"{stray.label}: due, and not renewed: the fleet has no node {stray.holder.name}"
             _say(f"{told}; `zsched pki revoke {stray.label}` ends it")
         due = [one.label for one in wanted if one.holder.name in members]
-        secret = _passphrase(authority) if due else b""
+        secret = passphrase_of(authority) if due else b""
         for one in due:
-            authority.renew(one, None, b"", secret, _now())
+            authority.renew(one, None, b"", secret, now_here())
         newest = [entry for one in named if (entry := authority.record.entry(one.label)) is not None]
     results = [_send(door, entry) for entry in newest if entry.holder.name in members]
     return EXIT_OK if all(one in (SENT, HAD) for one in results) else EXIT_FAILED
@@ -403,7 +304,7 @@ def _see_anew(door: Door, authority: Authority, members: set[str]) -> None:
     """
     if not authority.is_rotating:
         return
-    age_s, before, old = (_now() - authority.since).total_seconds(), dict(authority.record.lives), []
+    age_s, before, old = (now_here() - authority.since).total_seconds(), dict(authority.record.lives), []
     for name in sorted(members):
         with contextlib.suppress(CliError):  # it is away
             status = ask_door(Door(socket=door.socket, node=name), {"verb": "status"})
@@ -457,7 +358,7 @@ def show(
 def revoke(where: Where, name: LabelArgument) -> int:
     """Never certify a key again, and say which line of the fleet file keeps it out."""
     with _opened(where) as (office, authority):
-        entry = authority.revoke(name, _now())
+        entry = authority.revoke(name, now_here())
         security = office.fleet.security
         revoked = sorted({*(security.revoked if security else ()), name})
     name, role = entry.holder.name, entry.holder.role
@@ -477,7 +378,7 @@ def rotate(
     """Begin with a new authority. Both are trusted until --finish, which waits for every certificate to be renewed."""
     with _opened(where) as (_, authority):
         if not finish:
-            authority.rotate(_passphrase(authority), _now(), _lives(authority.record.fleet))
+            authority.rotate(passphrase_of(authority), now_here(), _lives(authority.record.fleet))
             _say(
                 f"authority {authority.record.number} signs from now on; the former one is trusted until the end",
                 f"1. put {authority.folder / TRUSTED} on every machine as {TRUSTED}, and wait until each daemon has "
@@ -620,16 +521,12 @@ def check_held(fleet: Fleet, given: Path | None) -> None:
         CliError: it is not trusted here.
         AdapterError: it cannot be used.
     """
-    folder = holds_authority(fleet.name, given)
-    if folder is None or fleet.security is None:
-        return
-    from zsched.pki.authority import opened  # noqa: PLC0415 - imports cryptography
-
-    with opened(folder, fleet.name) as authority:
-        check_trusted(fleet, authority)
+    with held_here(fleet.name, given) as authority:
+        if authority is not None and fleet.security is not None:
+            check_trusted(fleet, authority)
 
 
-def _check_name(fleet: Fleet, name: str, role: Role) -> tuple[str, ...]:
+def hosts_of(fleet: Fleet, name: str, role: Role) -> tuple[str, ...]:
     """At which addresses the holder is dialled, by the fleet file."""
     check_name(name)
     nodes = {node.name: node for node in fleet.nodes}
@@ -713,7 +610,12 @@ def _write(folder: Path, issued: Issued) -> None:
         raise AdapterError(f"{folder}: cannot be written: {error.strerror}; {again}") from error
 
 
-def _request(path: Path | None) -> bytes:
+def read_request(path: Path | None) -> bytes:
+    """A certificate request in a file; empty: none is named.
+
+    Raises:
+        AdapterError: it cannot be read.
+    """
     if path is None:
         return b""
     try:
@@ -722,7 +624,8 @@ def _request(path: Path | None) -> bytes:
         raise AdapterError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _passphrase(authority: Authority) -> bytes:
+def passphrase_of(authority: Authority) -> bytes:
+    """What opens its key. Raises `CliError`: nobody types it."""
     if not authority.is_locked:
         return b""
     if PASSPHRASE in os.environ:
@@ -732,10 +635,10 @@ def _passphrase(authority: Authority) -> bytes:
     return _asked(f"Passphrase of {authority.key_path}")
 
 
-def _new_passphrase() -> bytes:
-    if os.environ.get(PASSPHRASE):
-        return os.environ[PASSPHRASE].encode()
-    return _asked("Passphrase of the new key", is_new=True)
+def new_secret(*, is_wanted: bool) -> bytes:
+    """What locks a new key; empty: nothing."""
+    given = os.environ.get(PASSPHRASE, "").encode()
+    return given or (_asked("Passphrase of the new key", is_new=True) if is_wanted else b"")
 
 
 def _asked(what: str, *, is_new: bool = False) -> bytes:
@@ -749,7 +652,7 @@ def _asked(what: str, *, is_new: bool = False) -> bytes:
 
 
 def _as_json(office: _Office, authority: Authority) -> Json:
-    now, record = _now(), authority.record
+    now, record = now_here(), authority.record
     return {
         "schema": SCHEMA,
         "fleet": record.fleet,
@@ -789,7 +692,8 @@ def _day(entry: Entry) -> str:
     return _iso(entry.until)[:10]
 
 
-def _now() -> datetime:
+def now_here() -> datetime:
+    """By this machine's clock."""
     return datetime.fromtimestamp(wall_ns() / 1e9, UTC)
 
 

@@ -12,48 +12,43 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.change import user_name
-from zsched.commands.common import CliError, check_dangers, check_taken, confirm, say, warn
+from zsched.commands.ask import Door
+from zsched.commands.change import OrderView, Plan, consent, user_name
+from zsched.commands.common import CliError, check_dangers, say, warn
 from zsched.commands.init import Place, create_state, place_of
 from zsched.commands.options import AcceptOption, Here, PlanOption, YesOption
 from zsched.core.electorate.recovery import Danger, Recovery, consider
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import SAID_DIGITS, FleetValue
 from zsched.core.values.model import RegisterState
-from zsched.core.values.struct import Struct
 from zsched.core.values.words import MAX_ASKER, shown
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
+from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.runtime import recovery as runtime
 
 DANGERS = tuple(danger.value for danger in Danger)
 
 
-class Manner(Struct, frozen=True, kw_only=True):
-    """How it is shown and confirmed."""
-
-    is_plan: bool = False
-    is_sure: bool = False
-    accepted: tuple[str, ...] = ()
-
-
-def begin_generation(place: Place, manner: Manner, brought: Sequence[Path]) -> int:
+def begin_generation(place: Place, view: OrderView, brought: Sequence[Path]) -> int:
     """Make this node the only elector of a new generation; the exit code.
 
     Raises:
         CliError: something speaks against it, a danger is not accepted, or the operator says no.
         AdapterError: a daemon runs here, or a state cannot be read or written.
     """
-    check_dangers(manner.accepted, DANGERS)
+    check_dangers(view.accepted, DANGERS)
     plan = consider(runtime.look(place.fleet, place.node, place.config, place.folder, brought))
     if isinstance(plan, str):
         raise CliError(EXIT_FAILED, f"nothing was changed: {plan}")
     draft = plan.carry_out(generation_id="0", disk="", incarnation=0, hardware="")
-    say(_table(plan, draft))
-    if manner.is_plan:
-        return EXIT_WOULD_CHANGE
-    check_taken([(danger.value, means) for danger, means in plan.dangers], manner.accepted)
-    question = f"Make {place.node} the only elector of a new generation of {place.fleet.name}?"
-    confirm(question, is_sure=manner.is_sure)
+    shown = Plan(
+        text=_table(plan, draft),
+        body={},
+        dangers=[(danger.value, means) for danger, means in plan.dangers],
+        question=f"Make {place.node} the only elector of a new generation of {place.fleet.name}?",
+    )
+    code = consent(view, shown)
+    if code is not None:
+        return code
     state = runtime.recover(plan, place.config, place.folder, brought)
     before, after = plan.before, _value_of(state)
     _note(
@@ -66,7 +61,7 @@ def begin_generation(place: Place, manner: Manner, brought: Sequence[Path]) -> i
     return EXIT_OK
 
 
-def rejoin_side(place: Place, manner: Manner, wanted: str) -> int:
+def rejoin_side(place: Place, view: OrderView, wanted: str) -> int:
     """Let this node change sides to another generation; the exit code.
 
     Raises:
@@ -78,10 +73,10 @@ def rejoin_side(place: Place, manner: Manner, wanted: str) -> int:
         raise CliError(EXIT_FAILED, f"nothing was changed: {side}")
     by = f", recovered by {side.recovered_by}" if side.recovered_by else ""
     told = f"generation {side.generation_id[:SAID_DIGITS]}{by} ({', '.join(side.nodes)} count by it)"
-    say(f"{place.node}: follows {told}, and starts blank there; what it knew of its own generation is dropped")
-    if manner.is_plan:
-        return EXIT_WOULD_CHANGE
-    confirm(f"Let {place.node} change sides?", is_sure=manner.is_sure)
+    what = f"follows {told}, and starts blank there; what it knew of its own generation is dropped"
+    code = consent(view, Plan(text=f"{place.node}: {what}", body={}, question=f"Let {place.node} change sides?"))
+    if code is not None:
+        return code
     path, state = runtime.rejoin(place.fleet, place.node, place.folder, own, side)
     _note(place, state, f"rejoined generation {side.generation_id[:SAID_DIGITS]}{by}")
     say(f"{path}: blank state of {place.node}, which is to follow {side.generation_id[:SAID_DIGITS]}")
@@ -197,8 +192,8 @@ def recover_fleet(
         raise CliError(EXIT_USAGE, "give one of --rejoin, --generation G and --settle; the last two go without --plan")
     if (wanted and not rejoin) or (brought and (rejoin or is_anew)):
         raise CliError(EXIT_USAGE, "a GENERATION goes with --rejoin, and --from with neither it nor --generation")
-    place, manner = place_of(here), Manner(is_plan=plan, is_sure=yes, accepted=accepted)
+    place, view = place_of(here), OrderView(door=Door(socket=Path()), is_plan=plan, is_yes=yes, accepted=accepted)
     if is_anew:
         create_state(place, generation, is_forced=force, is_settling=settle, accepted=accepted)
         return EXIT_OK
-    return rejoin_side(place, manner, wanted) if rejoin else begin_generation(place, manner, tuple(brought or ()))
+    return rejoin_side(place, view, wanted) if rejoin else begin_generation(place, view, tuple(brought or ()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -16,89 +17,91 @@ from zsched.clock import wall_ns
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.common import CliError, Json, print_json, wants_color, warn
 from zsched.commands.options import Answers, NoColorOption
-from zsched.commands.report import TROUBLES, degradations, render_status
-from zsched.core.values.struct import Struct
+from zsched.commands.page import page_width
+from zsched.commands.report import TROUBLES, degradations, render_brief, render_status
 from zsched.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.screen import CUT_LINES, WRAP_LINES, drawn, fitted
 
-MIN_WIDTH, DEFAULT_WIDTH, MAX_WIDTH = 60, 100, 160
 MAJOR = "1"
 """Of the status's schema: within it fields are only added."""
 CLEAR = "\x1b[2J"
 
 
-class StatusView(Struct, frozen=True, kw_only=True):
-    """Which daemon to ask, and how to show the answer."""
+def status(
+    asked: Answers,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
+    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
+    site: Annotated[bool, typer.Option("--site", help="A line for each fleet of the site, with --json only.")] = False,
+    no_color: NoColorOption = False,
+) -> int:
+    """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
 
-    door: Door
-    is_json: bool
-    is_plain: bool
-    is_whole: bool = False
-    """All six blocks, instead of a line per node and task."""
+    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner. With --site it asks the fleets
+    under `site:` in the document, or in the fleet file, and one that does not answer is degraded, too.
+    """
+    if site:
+        from zsched.commands.cells import of_site, show_site  # noqa: PLC0415 - only a site has them
 
+        if verbose or watch:
+            raise CliError(EXIT_USAGE, "--site shows a line for each fleet; leave out -v and --watch")
+        return show_site(*of_site(asked), is_json=asked.json_)
+    door, render = asked.door(), render_status if verbose else render_brief
 
-def show(view: StatusView) -> int:
-    """Print one status; returns the exit code."""
-    status = ask_status(view.door)
-    if view.is_json:
+    def text(status: Json) -> str:
+        return render(status, page_width(), wants_color(no_color), wall_ns() / 1e9)
+
+    status = ask_status(door)
+    if watch:
+        return _watch_on(door, status, interval, None if asked.json_ else text)
+    if asked.json_:
         print_json(_with_reasons(status))
     else:
-        sys.stdout.write(_render(view, status))
+        sys.stdout.write(text(status))
     return code_of(status)
 
 
-def watch_on(view: StatusView, interval_s: float) -> int:
+def _watch_on(door: Door, status: Json, interval_s: float, text: Callable[[Json], str] | None) -> int:
     """Print a status every ``interval_s`` until Ctrl-C; a daemon that goes away meanwhile is waited for.
 
-    Returns the exit code of the last status.
-
-    Raises:
-        CliError: already the first question found nobody.
+    ``text``: for people; ``None``: lines of JSON. Returns the exit code of the last status.
     """
-    status: Json | CliError = ask_status(view.door)
-    is_screen = sys.stdout.isatty() and not view.is_json
-    code = EXIT_OK
+    is_screen = sys.stdout.isatty() and text is not None
+    code = code_of(status)
     try:
         sys.stdout.write(CLEAR if is_screen else "")
+        _print_next(status, text, is_screen=is_screen)
         while True:
-            code = status.code if isinstance(status, CliError) else code_of(status)
-            _print_next(view, status, is_screen=is_screen)
             time.sleep(interval_s)
-            status = _ask_again(view.door)
+            try:
+                status = ask_status(door)
+            except CliError as error:
+                code, why = error.code, f"zsched status: {error}"
+                if is_screen:
+                    _draw(fitted(f"{why}\nasking again until Ctrl-C\n", sys.stdout))
+                else:
+                    warn(why)
+            else:
+                code = code_of(status)
+                _print_next(status, text, is_screen=is_screen)
     except KeyboardInterrupt:
         sys.stdout.write("\n" if is_screen else "")
         return code
 
 
-def _render(view: StatusView, status: Json) -> str:
-    if view.is_whole:
-        return render_status(status, _width(), wants_color(view.is_plain), wall_ns() / 1e9)
-    from zsched.commands.report import render_brief  # noqa: PLC0415 - only what is shown is loaded
-
-    return render_brief(status, _width(), wants_color(view.is_plain), wall_ns() / 1e9)
-
-
-def _ask_again(door: Door) -> Json | CliError:
-    try:
-        return ask_status(door)
-    except CliError as error:
-        return error
-
-
-def _print_next(view: StatusView, status: Json | CliError, *, is_screen: bool) -> None:
-    if isinstance(status, CliError):
-        text = f"zsched status: {status}"
-        if not is_screen:
-            warn(text)
-            return
-        text = fitted(f"{text}\nasking again until Ctrl-C\n", sys.stdout)
-    elif view.is_json:
+def _print_next(status: Json, text: Callable[[Json], str] | None, *, is_screen: bool) -> None:
+    if text is None:
         print_json(_with_reasons(status), is_line=True)
-        return
+    elif is_screen:
+        _draw(text(status))
     else:
-        text = _render(view, status)
-    # who stops us between two pictures has the terminal as it was
-    sys.stdout.write(f"{CUT_LINES}{_fitted(text)}{WRAP_LINES}" if is_screen else f"{text}\n")
+        sys.stdout.write(f"{text(status)}\n")
+        sys.stdout.flush()
+
+
+def _draw(text: str) -> None:
+    """Who stops us between two pictures has the terminal as it was."""
+    sys.stdout.write(f"{CUT_LINES}{_fitted(text)}{WRAP_LINES}")
     sys.stdout.flush()
 
 
@@ -107,7 +110,7 @@ def _fitted(text: str) -> str:
 
     Of a text that is too high the problems stay, at most in the lower half, with a count of those that have no room.
     """
-    height = shutil.get_terminal_size((DEFAULT_WIDTH, 30)).lines
+    height = shutil.get_terminal_size((100, 30)).lines
     lines = text.splitlines()
     if len(lines) > height:
         last = next((at for at, line in enumerate(lines) if TROUBLES in line[:20]), len(lines))
@@ -143,31 +146,3 @@ def _with_reasons(status: Json) -> Json:
 def code_of(status: Json) -> int:
     """The exit code that tells how the fleet is: 0, or 4 while it is degraded."""
     return EXIT_DEGRADED if degradations(status) else EXIT_OK
-
-
-def _width() -> int:
-    return max(MIN_WIDTH, min(shutil.get_terminal_size((DEFAULT_WIDTH, 30)).columns, MAX_WIDTH))
-
-
-def status(
-    asked: Answers,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="All six stages, not only a line per task.")] = False,
-    watch: Annotated[bool, typer.Option("--watch", "-w", help="Again and again; with --json one line each.")] = False,
-    interval: Annotated[float, typer.Option(min=0.1, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
-    site: Annotated[bool, typer.Option("--site", help="A line for each fleet of the site, with --json only.")] = False,
-    no_color: NoColorOption = False,
-) -> int:
-    """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
-
-    Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner. With --site it asks the fleets
-    under `site:` in the document, or in the fleet file, and one that does not answer is degraded, too.
-    """
-    if site:
-        from zsched.commands.cells import of_site, show_site  # noqa: PLC0415 - each verb imports what it needs
-
-        if verbose or watch:
-            raise CliError(EXIT_USAGE, "--site shows a line for each fleet; leave out -v and --watch")
-        return show_site(*of_site(asked), is_json=asked.json_)
-
-    view = StatusView(door=asked.door(), is_json=asked.json_, is_plain=no_color, is_whole=verbose)
-    return watch_on(view, interval) if watch else show(view)

@@ -32,7 +32,6 @@ from zsched.cli import app
 from zsched.commands import membership, papers
 from zsched.commands.common import CliError
 from zsched.commands.membership import Address, address_of, dial_order, how_to_start, own_address
-from zsched.commands.pki import begin_for
 from zsched.commands.renewing import UNIT_FOLDER, renew_advice
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
@@ -367,14 +366,14 @@ def test_a_signal_while_a_fleet_is_founded_leaves_no_half_of_it(
     """An authority, or a fleet file, without a state would be in the way of the next try."""
 
     def interrupted(*words: Any, **more: Any) -> Any:
-        begun = begin_for(*words, **more)
+        made = create(*words, **more)
         signal.raise_signal(number)
-        return begun
+        return made
 
     def ended(*_: Any) -> None:
         pytest.fail("the signal ends the verb")
 
-    monkeypatch.setattr(papers, "begin_for", interrupted)
+    monkeypatch.setattr("zsched.pki.authority.create", interrupted)
     before = signal.signal(number, ended)
     request.addfinalizer(lambda: signal.signal(number, before))
     result = run("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path))
