@@ -35,7 +35,7 @@ GAP_S: Final = 3.0
 """How long a settled move is watched for the new owner's first answers; the relays count once a second."""
 KNOWN_S: Final = 3.0
 """How long a daemon that has just begun may take to hear a living node's profile; nodes publish once a second."""
-BLANK: Final = dict.fromkeys(("epoch", "switched_s", "gap_s", "lost", "doubled"))
+BLANK: Final = dict.fromkeys(("switched_s", "gap_s", "lost", "doubled"))
 
 
 def move(
@@ -61,8 +61,8 @@ def move(
     planned = agreed(task, ask_door(view.door, {**request, "plan": True}))
 
     def body(revision: int, **more: Any) -> Json:
-        head = {"schema": MOVE_SCHEMA, "task": task, "from": left, "to": to, "revision": revision, "settled": False}
-        return {**head, **BLANK, "missing": [], **more}
+        head = {"schema": MOVE_SCHEMA, "task": task, "from": left, "to": to, "epoch": None, "revision": revision}
+        return {**head, "settled": False, **BLANK, "missing": [], **more}
 
     row = (task, "owner", str(left or "nobody"), to)
     code = consent(view, Plan(rows=[row], body=body(before["revision"]), is_change=planned["outcome"] == "ok"))
