@@ -23,7 +23,7 @@ from typing import Final
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door, operator_at
 from zsched.commands.common import CliError, Json, check_reason, check_taken, confirm, print_json, say, told_task, warn
-from zsched.commands.page import span
+from zsched.commands.page import Row, lined, span
 from zsched.commands.report import millis
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import MAX_FOR_S
@@ -70,8 +70,6 @@ ADVICE: Final = {
     "unknown": "it may or may not have been agreed: `zsched status` shows which",
 }
 NOTHING: Final = "-"
-Row = tuple[str, str, str, str]
-"""(task, what, before, after)."""
 
 
 class OrderView(Struct, frozen=True, kw_only=True):
@@ -174,13 +172,6 @@ def consent(view: OrderView, plan: Plan) -> int | None:
     stream = sys.stderr if view.is_data else sys.stdout
     confirm(question, is_sure=view.is_yes, can_ask=plan.can_ask and not view.is_json, stream=stream)
     return None
-
-
-def lined(titles: Row, rows: Sequence[Row]) -> list[str]:
-    """A table as lines; none where it has no row."""
-    shown = [titles, *rows] if rows else []
-    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in shown]
 
 
 class OverError(CliError):

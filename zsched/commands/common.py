@@ -190,11 +190,13 @@ class Verbs(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Each verb with its whole first sentence, over several lines if need be: typer's own cuts it at the width."""
-        verbs = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [(name, verb.get_short_help_str(LONGEST_SENTENCE)) for name, verb in verbs if verb and not verb.hidden]
-        if rows:
-            with formatter.section("Commands"):
-                formatter.write_dl(rows)
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, self.told_briefly(ctx, name)) for name in self.list_commands(ctx)])
+
+    def told_briefly(self, ctx: Any, name: str) -> str:
+        """The first sentence of a verb's help."""
+        verb: Any = self.get_command(ctx, name)
+        return str(verb.get_short_help_str(LONGEST_SENTENCE))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""

@@ -64,7 +64,7 @@ def _candidates(command: Any, ctx: Any, position: int, option: Any, last: str) -
             "--help"
         ]
     if hasattr(command, "commands"):
-        return [name for name in command.list_commands(ctx) if not command.get_command(ctx, name).hidden]
+        return list(command.list_commands(ctx))
     arguments = [param for param in command.params if param.param_type_name == "argument"]
     return _values(arguments[position]) if position < len(arguments) else []
 

@@ -5,23 +5,18 @@ Knows: how results are shown, exit codes. Does not know: any check (`zsched.doct
 
 from __future__ import annotations
 
-import os
 import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from zsched import paths as places
-from zsched.commands.ask import name_here
 from zsched.commands.common import Json, print_json, wants_color
-from zsched.commands.options import JsonOption, NoColorOption
-from zsched.commands.options import Machine as Here
+from zsched.commands.options import JsonOption, Machine, NoColorOption
 from zsched.commands.page import Page, page_width
-from zsched.doctor.look import Machine, look
+from zsched.doctor.look import look
 from zsched.doctor.model import Check, Result, Scene, Verdict
 from zsched.doctor.table import run_all, worst
 from zsched.exits import EXIT_FAILED, EXIT_OK
@@ -34,23 +29,8 @@ INDENT: Final = 5
 Results = list[tuple[Check, Result]]
 
 
-def machine_of(config: Path | None, node: str | None, state_dir: Path | None, runtime_dir: Path | None) -> Machine:
-    """Where this machine's things are, by the options and the environment.
-
-    Raises:
-        CliError: several daemons run here, and nothing says which is meant.
-    """
-    runtime = places.asked_folder(runtime_dir, os.environ)
-    return Machine(
-        file=places.config_path(config, os.environ),
-        state_folder=places.asked_state_folder(state_dir, os.environ, runtime),
-        runtime_folder=runtime,
-        node=name_here(node, runtime_dir),
-    )
-
-
 def doctor(
-    here: Here,
+    here: Machine,
     fleet: Annotated[bool, typer.Option("--fleet", help="Ask every node, and compare what they say.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 on a warning, too.")] = False,
     json_: JsonOption = False,

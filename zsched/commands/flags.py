@@ -22,7 +22,6 @@ from zsched.commands.change import (
     OrderView,
     OverError,
     Plan,
-    Row,
     change_over,
     check_revision,
     consent,
@@ -38,7 +37,7 @@ from zsched.commands.change import (
 )
 from zsched.commands.common import CliError, Json, check_dangers, check_known, print_json, say, told_task
 from zsched.commands.options import Changes, ForOption, Orders
-from zsched.commands.page import duration_s, span
+from zsched.commands.page import Row, duration_s, span
 from zsched.commands.report import told_flag
 from zsched.commands.wait import Condition, missing
 from zsched.config.difference import SEAT_AGAIN, names_electors, unseated

@@ -132,9 +132,7 @@ def history(
         raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
     past = Past(task=task or of_task, about=of_node, since_s=None if since is None else duration_s(since))
     if site:
-        from zsched.commands.cells import of_site, show_histories  # noqa: PLC0415 - only a site has them
-
-        return show_histories(*of_site(asked), past, is_json=asked.json_)
+        return _show_site(asked, past)
     door = asked.door()
     told = past.read(door)
     if not any(told[key] for key in TOLD):
@@ -147,6 +145,34 @@ def history(
         say(f"no move and no order{past.words} in the log of {told['node']}")
     print_lines(lines)
     return EXIT_OK
+
+
+def _show_site(asked: Answers, past: Past) -> int:
+    """Print the moves of all cells by their age, the newest last, and who is silent; returns the exit code.
+
+    Each cell's moves are told by one of its nodes, with ages by that node's clock: no two clocks are compared.
+    """
+    from zsched.commands.cells import alone, ask_site  # noqa: PLC0415 - only a site has them
+
+    fleet, cells = ask_site(asked, past.read, {"node": None, **{key: [] for key in TOLD}})
+    silent = [cell for cell in cells if cell["error"] is not None]
+    heard = [cell for cell in cells if cell["error"] is None]
+    if asked.json_:
+        merged = {key: [{**one, "cell": cell["name"]} for cell in cells for one in cell[key]] for key in TOLD}
+        ordered = {key: sorted(found, key=lambda one: -float(one["age_s"])) for key, found in merged.items()}
+        told = [{key: cell[key] for key in ("name", "node", "error")} for cell in cells]
+        first = next((cell["node"] for cell in heard), "")
+        print_json({"schema": SCHEMA, "node": first, **ordered, "cells": told})
+    else:
+        width = max(len(cell["name"]) for cell in cells)
+        lines = [line for cell in cells for line in lines_of(cell, f"{cell['name']:<{width}}  ")]
+        print_lines(lines)
+        if not lines and heard:
+            say(f"no move and no order{past.words} in {', '.join(cell['name'] for cell in heard)}")
+        said = [f"  {cell['name']}: {cell['error']}" for cell in silent]
+        for line in (*(("PROBLEMS", *said) if said else ()), *alone(fleet)):
+            say(line, indent=4)
+    return EXIT_OK if heard else EXIT_UNREACHABLE
 
 
 def _check_names(door: Door, past: Past) -> None:

@@ -30,7 +30,6 @@ from zsched.commands.change import (
     OrderView,
     OverError,
     Plan,
-    Row,
     ask_all,
     change,
     check_said,
@@ -38,7 +37,6 @@ from zsched.commands.change import (
     document_text,
     fleet_of,
     in_force,
-    lined,
     ordered,
     until,
 )
@@ -55,7 +53,7 @@ from zsched.commands.flags import (
 )
 from zsched.commands.membership import Told
 from zsched.commands.options import AcceptOption, Files, JsonOption, PlanOption, ReasonOption, RuntimeOption, YesOption
-from zsched.commands.page import duration_s, span
+from zsched.commands.page import Row, duration_s, lined, span
 from zsched.commands.renewing import HOLDS_AUTHORITY, authority_here, bring_advice, left_behind
 from zsched.config.difference import names_electors
 from zsched.config.editing import remove_node

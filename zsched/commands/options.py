@@ -215,12 +215,24 @@ class Machine(Here):
     runtime_dir: RuntimeOption = None
 
     def machine(self) -> doctor.Machine:
-        """The same for the doctor. Raises `CliError` (2): the node's name is none."""
-        from zsched.commands.doctor import machine_of  # noqa: PLC0415 - as above
+        """The same for the doctor, by the options and the environment.
+
+        Raises:
+            CliError: the node's name is none, or several daemons run here and nothing says which is meant (2).
+        """
+        from zsched import paths  # noqa: PLC0415 - as above
+        from zsched.commands.ask import name_here  # noqa: PLC0415 - as above
         from zsched.commands.here import own_name  # noqa: PLC0415 - as above
+        from zsched.doctor.look import Machine  # noqa: PLC0415 - as above
 
         own_name(self.node)
-        return machine_of(self.config, self.node, self.state_dir, self.runtime_dir)
+        runtime = paths.asked_folder(self.runtime_dir, os.environ)
+        return Machine(
+            file=paths.config_path(self.config, os.environ),
+            state_folder=paths.asked_state_folder(self.state_dir, os.environ, runtime),
+            runtime_folder=runtime,
+            node=name_here(self.node, self.runtime_dir),
+        )
 
 
 class _Spread:

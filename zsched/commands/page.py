@@ -9,6 +9,7 @@ import re
 import shutil
 import textwrap
 import time
+from collections.abc import Sequence
 from typing import Any, Final, TypeAlias
 
 from zsched.commands.common import CliError, Json
@@ -31,6 +32,17 @@ Cell: TypeAlias = tuple[str, str]
 def page_width() -> int:
     """Columns of the terminal, as far as a page uses them."""
     return max(60, min(shutil.get_terminal_size((100, 30)).columns, 160))
+
+
+Row = tuple[str, str, str, str]
+"""Of a table: (task, what, before, after) of a change."""
+
+
+def lined(titles: Row, rows: Sequence[Row]) -> list[str]:
+    """A table as lines; none where it has no row."""
+    shown = [titles, *rows] if rows else []
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in shown]
 
 
 class Page:

@@ -20,11 +20,11 @@ import typer
 from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.change import IN_FORCE_S, OrderView, Plan, Row, asker, consent, document_text, in_force
+from zsched.commands.change import IN_FORCE_S, OrderView, Plan, asker, consent, document_text, in_force
 from zsched.commands.common import CliError, Json, ends_as_by_ctrl_c, nearest, print_json, say, told_task, warn
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
 from zsched.commands.options import Orders
-from zsched.commands.page import counted
+from zsched.commands.page import Row, counted
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight

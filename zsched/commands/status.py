@@ -41,11 +41,11 @@ def status(
     under `site:` in the document, or in the fleet file, and one that does not answer is degraded, too.
     """
     if site:
-        from zsched.commands.cells import of_site, show_site  # noqa: PLC0415 - only a site has them
+        from zsched.commands.cells import show_site  # noqa: PLC0415 - only a site has them
 
         if verbose or watch:
             raise CliError(EXIT_USAGE, "--site shows a line for each fleet; leave out -v and --watch")
-        return show_site(*of_site(asked), is_json=asked.json_)
+        return show_site(asked)
     door, render = asked.door(), render_status if verbose else render_brief
 
     def text(status: Json) -> str:

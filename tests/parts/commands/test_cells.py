@@ -12,10 +12,11 @@ from support.doors import answering
 from support.schemas import faults
 from zsched.commands import ask
 from zsched.commands.ask import ask_door, find_door
-from zsched.commands.cells import show_histories, show_site
+from zsched.commands.cells import show_site
 from zsched.commands.change import asker, user_name
 from zsched.commands.common import CliError, Json
-from zsched.commands.history import Past
+from zsched.commands.history import history
+from zsched.commands.options import Answers
 from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched_lab.fleet.loopback import free_endpoint, own_address
 
@@ -51,6 +52,10 @@ def test_a_cell_that_there_is_not_is_a_fault_of_usage(word: str, told: str) -> N
     assert refused.value.code == EXIT_USAGE
 
 
+def asked(*, is_json: bool) -> Answers:
+    return Answers({"node": None, "runtime_dir": None, "connect": None, "json_": is_json})
+
+
 def test_a_cell_without_an_answer_names_each_gateway(gateways: tuple[str, str]) -> None:
     door = find_door(None, "hall-b/robot7")
     with pytest.raises(CliError, match=r"hall-b/robot7 cannot be asked; by tcp/.*; by tcp/") as refused:
@@ -75,13 +80,13 @@ def test_an_order_tells_the_fleet_and_the_machine_it_comes_from() -> None:
 
 @pytest.mark.usefixtures("gateways")
 def test_a_site_of_which_no_cell_answers_exits_with_3(capsys: pytest.CaptureFixture[str]) -> None:
-    assert show_site(None, None, is_json=False) == EXIT_UNREACHABLE
+    assert show_site(asked(is_json=False)) == EXIT_UNREACHABLE
     assert "hall-b: cell hall-b cannot be asked" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("gateways")
 def test_a_history_of_which_no_cell_tells_exits_with_3(capsys: pytest.CaptureFixture[str]) -> None:
-    assert show_histories(None, None, Past(), is_json=False) == EXIT_UNREACHABLE
+    assert history(asked(is_json=False), site=True) == EXIT_UNREACHABLE
     assert capsys.readouterr().out.startswith("PROBLEMS\n  hall-b: cell hall-b cannot be asked; by tcp/")
 
 
@@ -99,14 +104,14 @@ def test_a_silent_cell_is_named_and_the_history_of_the_others_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with answering(ours, tmp_path, monkeypatch):
-        assert show_histories(None, None, Past(), is_json=False) == EXIT_OK
+        assert history(asked(is_json=False), site=True) == EXIT_OK
         move, title, problem = capsys.readouterr().out.splitlines()
         assert move.startswith("hall-a   1m00s ago  ")
         assert move.endswith("echo epoch 2  edge1 -> edge2: edge1 is gone")
         assert (title, problem.startswith("  hall-b: cell hall-b cannot be asked")) == ("PROBLEMS", True)
-        assert show_histories(None, None, Past(task="other"), is_json=False) == EXIT_OK
+        assert history(asked(is_json=False), "other", site=True) == EXIT_OK
         assert capsys.readouterr().out.startswith("no move and no order of other in hall-a\nPROBLEMS\n")
-        assert show_histories(None, None, Past(), is_json=True) == EXIT_OK
+        assert history(asked(is_json=True), site=True) == EXIT_OK
     told = json.loads(capsys.readouterr().out)
     assert faults(told) == []
     assert [(move["cell"], move["to"]) for move in told["moves"]] == [("hall-a", "edge2")]

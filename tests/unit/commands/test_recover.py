@@ -185,7 +185,7 @@ def test_off_a_terminal_it_takes_yes_and_at_one_the_answer_counts(
     assert value.learnt is not None
     assert (value.learnt.electorate.names, value.learnt.recovered_by) == (("robot1",), "robot1")
     named = value.learnt.generation_id[:8]
-    assert captured.out.partition("[y/N] ")[2].splitlines()[-5:] == [
+    assert captured.out.rpartition("[y/N] ")[2].splitlines()[-5:] == [
         f"robot1 is the only elector of generation {named}",
         "next: start this daemon",
         f"then on each of robot2, robot3: stop zsched, `zsched fleet recover --rejoin {named}`, start it",
