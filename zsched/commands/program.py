@@ -146,8 +146,8 @@ class Program(Verbs):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """All verbs, for the help."""
-        own = list(VERBS)
-        return [*own, *(name for name in installed_verbs() if name not in own)]
+        del ctx
+        return [*VERBS, *(name for name in installed_verbs() if name not in VERBS)]
 
     def told_briefly(self, ctx: Any, name: str) -> str:
         """As of any group; of a verb of the program it is read, and the verb not made."""
