@@ -21,6 +21,7 @@ from zsched.core.scheduler.judge import Judge
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import compare
 from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeKind, PeerState, ScoreForm, Tuning, UtilityVector, Weights
 from zsched.core.values.profile import Jobs, Link, LinkSource, Profile, WorkerLoad, WorkerState
@@ -60,7 +61,7 @@ class Round:
         nodes = [NodeSpec(name=name, kind=NodeKind.EDGE) for name in edges]
         nodes += [NodeSpec(name=name, kind=NodeKind.ROBOT) for name in names]
         fleet = Fleet(name="cost", timing=Timing(), nodes=tuple(nodes), tasks=(task,), electors=names)
-        made, is_told = cls(fleet, Gateway(fleet), tuning), tuning.score is ScoreForm.SERVICE
+        made, is_told = cls(fleet, Gateway(InForce(fleet)), tuning), tuning.score is ScoreForm.SERVICE
         for index, node in enumerate(fleet.nodes):
             link = Link(source=LinkSource.WIRELESS, rssi_dbm=-45.0 - index % 30)
             profile = Profile(

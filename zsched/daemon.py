@@ -42,6 +42,7 @@ from zsched.core.node import Node, in_parts
 from zsched.core.status import status_line
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet, WorkerLink, electorate_hash, fleet_hash
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.problems import Problem
 from zsched.core.values.snapshot import Exposure
@@ -285,15 +286,16 @@ class Daemon:
             limit=limit_for(fleet.timing, len(fleet.tasks)),
             names=names_of(fleet),
         )
-        access = StreamAccess(fleet, me, points.worker_connect[:1], self._texts[Side.VISIT])
+        here = InForce(fleet)
+        access = StreamAccess(here, me, points.worker_connect[:1], self._texts[Side.VISIT])
         decisions = DecisionLog(
             self._options.state_dir,
             me,
             incarnation,
             lambda problem: self._inbox.post(ev.ProblemReported(source="log", problem=problem)),
         )
-        desk = Desk(me, self._inbox, bus, access.answer, decisions.answer, self._leave)
-        tell_orders(fleet, desk, bus)
+        desk = Desk(me, self._inbox, bus, here, access.answer, decisions.answer, self._leave)
+        tell_orders(fleet, bus)
         operators = OperatorSocket(places.socket_path(self._options.runtime_dir, me), desk.answer)
         operators.open()
         with contextlib.suppress(OSError):
@@ -325,6 +327,7 @@ class Daemon:
         shell.measure_soon = sampler.hurry
         adoption = Adoption(
             me=me,
+            here=here,
             started_with=fleet,
             points=points,
             protocol=self._protocol,
@@ -333,14 +336,12 @@ class Daemon:
             supervisor=supervisor,
             relay=relay,
             bus=bus,
-            access=access,
-            desk=desk,
             sampler=sampler,
             compare_sessions=self._watch.note,
             post=self._inbox.post,
         )
         adoption.begin()
-        shell.follow, shell.end = adoption.adopt, adoption.end
+        shell.follow, shell.end = adoption.follow, adoption.end
         relay.start()
         stack.callback(lambda: relay.leave() if self._told.keeps_relay else relay.stop(1.0))
         stack.callback(lambda: supervisor.close(FINISH_WORKERS_S if self.begins_anew else CLOSE_WORKERS_S))
@@ -415,7 +416,7 @@ class Daemon:
             by_socket=((self._by_socket,), self._plain_text),
         )
         stack.callback(recipes.close)
-        recipes.adopt(fleet, points.worker_connect, dials_by_gossip=points.worker_by_gossip)
+        recipes.make(fleet, points.worker_connect, dials_by_gossip=points.worker_by_gossip)
         shell.crew.sessions, shell.crew.sessions_read = recipes.paths, recipes.read
         return WorkerSupervisor(
             specs=recipes.specs,

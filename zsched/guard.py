@@ -35,9 +35,6 @@ TOLD_S: Final = 600.0
 NAME_BYTES: Final = 15
 """The kernel keeps this much of a thread's name."""
 
-CALLS_BACK: Final = "(pyo3-closure)"
-"""So ends the name that Python gives a thread in which zenoh (1.10) calls back; it ends behind its session."""
-
 T = TypeVar("T")
 
 _log = logging.getLogger("zsched.guard")
@@ -68,28 +65,7 @@ def guarded(
         is_lasting: ``run`` returns only when it is meant to end, and may be called again when it has raised.
     """
     begin = partial(_run, partial(run, *args), kind or name, is_lasting=is_lasting)
-    return _Guarded(target=_named, args=(name, begin), name=name, daemon=True)
-
-
-class _Guarded(threading.Thread):
-    """A thread of ours, as opposed to the program's own."""
-
-
-def running() -> frozenset[threading.Thread]:
-    """Threads of ours that run now, and zenoh's that call back."""
-    return frozenset(one for one in threading.enumerate() if isinstance(one, _Guarded) or one.name.endswith(CALLS_BACK))
-
-
-def all_end_within(limit_s: float, besides: frozenset[threading.Thread]) -> bool:
-    """Wait until all threads of ours ``besides`` these have ended; whether they have.
-
-    An interpreter (CPython 3.11) that ends while one of its threads is inside zenoh aborts: the thread is ended where
-    it comes back for Python's lock, and Rust lets nobody unwind its frames.
-    """
-    until = monotonic_s() + limit_s
-    for thread in running() - besides - {threading.current_thread()}:
-        thread.join(max(0.0, until - monotonic_s()))
-    return not running() - besides - {threading.current_thread()}
+    return threading.Thread(target=_named, args=(name, begin), name=name, daemon=True)
 
 
 def ends_within(limit_s: float, run: Callable[..., object], *args: Any, name: str) -> bool:

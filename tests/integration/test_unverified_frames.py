@@ -37,6 +37,7 @@ from zsched.core.electorate.founding import founded
 from zsched.core.node import Node
 from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import Fleet, Security, electorate_hash
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -133,7 +134,9 @@ class Machine:
             post=inbox.post,
             seals=seals_of(fleet, LIFE),
         )
-        self.shell = Shell(node=me, inbox=inbox, bus=self.bus, state_file=self._file, desk=Desk(me, inbox, self.bus))
+        self.shell = Shell(
+            node=me, inbox=inbox, bus=self.bus, state_file=self._file, desk=Desk(me, inbox, self.bus, InForce(fleet))
+        )
         self.shell.relay = self.shell.crew.supervisor = cast("Any", Silent())
         self._log = self.shell.log = DecisionLog(folder, me, LIFE, lambda _problem: None)
         library = self.shell.library = Library(

@@ -12,6 +12,7 @@ from support.profiles import SAMPLE
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, Profile
 
 TIMING = Timing()
@@ -86,7 +87,7 @@ def test_profiles_are_smoothed_by_elapsed_time_where_they_are_measured() -> None
 def test_every_robot_s_gateway_holds_edge_data_of_every_edge() -> None:
     """Alg. 1: for each robot a gateway, for each edge its data, republished with respect to the edge."""
     profilers = {name: Profiler(name, 1, TIMING) for name in ("edge1", "edge2")}
-    gateways = [Gateway(FLEET) for _ in FLEET.voters]
+    gateways = [Gateway(InForce(FLEET)) for _ in FLEET.voters]
     for at, (name, profiler) in enumerate(profilers.items()):
         sampled(profiler, 0.0, cpu=1.0 + at)
         profile = published(profiler, 0.0)
@@ -106,7 +107,7 @@ def test_gateways_keep_the_most_updated_data() -> None:
     first = published(profiler, 0.0)
     sampled(profiler, 60.0, cpu=3.0)
     second = published(profiler, 60.0)
-    gateway = Gateway(FLEET)
+    gateway = Gateway(InForce(FLEET))
 
     assert gateway.absorb(second, 60.0) is None
     assert gateway.absorb(first, 60.1) == "stale"
@@ -120,7 +121,7 @@ def test_data_that_is_too_old_describes_nothing_any_more() -> None:
     """Reading of "most updated": edge data has an age, and beyond its time to live it is not used."""
     profiler = Profiler("edge1", 1, TIMING)
     sampled(profiler, 0.0)
-    gateway = Gateway(FLEET)
+    gateway = Gateway(InForce(FLEET))
     gateway.absorb(published(profiler, 0.0), 0.0)
 
     assert gateway.fresh("edge1", TIMING.profile_ttl_s) is not None

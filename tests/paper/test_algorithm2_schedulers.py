@@ -19,6 +19,7 @@ from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import compare, pick
 from zsched.core.values.fleet import Timing, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, PeerState, Proposal, Tuning, UtilityVector, Weights
 from zsched.core.values.profile import Link, LinkSource
@@ -41,7 +42,7 @@ def allocation(owner: str | None = "edge1", weights: Weights = BOTH, revision: i
 
 def gateway_with(now: float = SETTLED_S, **used: tuple[float, float]) -> Gateway:
     """Edge data: {edge: (CPU ratio, memory ratio) in use}."""
-    gateway = Gateway(FLEET)
+    gateway = Gateway(InForce(FLEET))
     for node in FLEET.nodes:
         cpu, memory = used.get(node.name, (0.5, 0.5))
         profile = profile_of(

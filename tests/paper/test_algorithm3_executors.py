@@ -18,6 +18,7 @@ from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.values.change import MoveOwner, Retune
 from zsched.core.values.fleet import StreamRule, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, PeerState, Proposal
 from zsched.core.values.plan import Direction, RoutePhase, RoutePlan
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
@@ -217,7 +218,7 @@ class Team:
         self.value = allocation(self.owner, 1)
         self.states = dict.fromkeys(ROBOTS, PeerState.ALIVE)
         self.profilers = {name: Profiler(name, 1, self.fleet.timing) for name in ROBOTS}
-        self.gateways = {name: Gateway(self.fleet) for name in ROBOTS}
+        self.gateways = {name: Gateway(InForce(self.fleet)) for name in ROBOTS}
         self.rounds = {
             name: Decider(self.fleet, name, gateway, at) for at, (name, gateway) in enumerate(self.gateways.items())
         }

@@ -290,9 +290,9 @@ def test_a_link_that_leaves_the_fleet_file_takes_its_problem_along(tmp_path: Pat
 
     sampler.start()
     until(lambda: told() == {"profile/link0", "profile/link1"}, "both cannot be read")
-    sampler.adopt(replace(spec("a"), links=links[1:]), 0.001)
+    sampler.measure(replace(spec("a"), links=links[1:]), 0.001)
     until(lambda: told() == {"profile/link0"}, "the other one only")
-    sampler.adopt(spec("a"), 0.001)
+    sampler.measure(spec("a"), 0.001)
     until(lambda: told() == set(), "none")
     sampler.stop()
 

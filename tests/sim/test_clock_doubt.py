@@ -13,6 +13,7 @@ from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.events import ClockCompared, HoldCommanded, MoveCommanded
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import RHO, hold_s
 from zsched.core.values.messages import Hold, HoldTask, MoveTask
 from zsched.core.values.model import Asked, ScoreForm
@@ -115,7 +116,9 @@ OF_EDGE1 = allocation_of(7, task="guard", epoch=3, tuning=tuning_of(cpu=1.0, mem
 
 
 def test_an_elector_in_doubt_grants_nothing_and_afterwards_begins_as_after_a_start() -> None:
-    leases = Leases(fleet=fleet("edge1", "edge2"), me="robot1", incarnation=1, standing={"guard": None}, now=0.0)
+    leases = Leases(
+        in_force=InForce(fleet("edge1", "edge2")), me="robot1", incarnation=1, standing={"guard": None}, now=0.0
+    )
     accepted = {"guard": ("edge1", 3)}
     assert leases.on_beat(beat("edge1", 5), accepted, 10.0)
     assert leases.on_sent(1, 10.0).echoes
@@ -134,7 +137,7 @@ def test_an_elector_in_doubt_grants_nothing_and_afterwards_begins_as_after_a_sta
 
 
 def test_an_owner_in_doubt_holds_no_lease_and_afterwards_only_by_new_beats() -> None:
-    leases = Leases(fleet=fleet("edge1", "edge2"), me="edge1", incarnation=1, standing={}, now=0.0)
+    leases = Leases(in_force=InForce(fleet("edge1", "edge2")), me="edge1", incarnation=1, standing={}, now=0.0)
     leases.begin("guard", 3, 5)
 
     def echoed(number: int, now: float) -> None:
@@ -158,8 +161,8 @@ def test_an_owner_in_doubt_holds_no_lease_and_afterwards_only_by_new_beats() -> 
 
 
 def test_beats_say_so_and_the_others_take_it_for_other_terms() -> None:
-    mine = Leases(fleet=fleet("edge1", "edge2"), me="edge1", incarnation=1, standing={}, now=0.0)
-    other = Leases(fleet=fleet("edge1", "edge2"), me="robot1", incarnation=1, standing={}, now=0.0)
+    mine = Leases(in_force=InForce(fleet("edge1", "edge2")), me="edge1", incarnation=1, standing={}, now=0.0)
+    other = Leases(in_force=InForce(fleet("edge1", "edge2")), me="robot1", incarnation=1, standing={}, now=0.0)
     mine.doubt({})
     other.on_beat(beat("edge1", 5, terms=mine.terms_told), {}, 10.0)
     assert "clock in doubt" in other.unfit()["edge1"].why

@@ -184,7 +184,7 @@ def test_a_fleet_that_gets_the_clocks_of_slow_links_is_changed_over_slow_links()
     slow = replace(FLEET, timing=WAN)
     assert play.told("robot1", ChangeFleet(document=play.document(slow))).outcome is CommandOutcome.OK
     play.settle(20)
-    play.sim.delay_s = (0.2, 0.25)
+    play.sim.delay_s = (0.93, 0.95)  # an answer comes after a whole round by the clocks of before
     result = play.told("robot1", ChangeFleet(document=play.document(replace(slow, relay_orphan_s=5.0))), WAN.order_s)
     assert result.outcome is CommandOutcome.OK
     assert play.sim.run_until(lambda: play.sim.node("robot3").fleet.relay_orphan_s == 5.0, 10)

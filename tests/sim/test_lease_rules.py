@@ -17,6 +17,7 @@ from zsched.core.executor.tenure import Tenure
 from zsched.core.instructions import SetRole
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec, lease_terms
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import RHO, hold_s
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import LIVES_KEPT, SENT_KEPT, Granter, Holder, Leases
@@ -272,7 +273,7 @@ FLEET = fleet_of(GUARD, of=ELECTORS, electors=ELECTORS)
 
 
 def leases() -> Leases:
-    held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=10.0)
+    held = Leases(in_force=InForce(FLEET), me="r1", incarnation=1, standing={}, now=10.0)
     held.begin("guard", 3, 5)
     held.on_sent(5, 10.0)
     return held
@@ -398,7 +399,7 @@ def tended(tenure: Tenure, number: int, now: float) -> tuple[list[do.Instruction
 def tenured() -> Tenure:
     executor = Executor(spec=GUARD, me="r1", has_streams=True)
     done(executor.execute, allocation_of(7, "r1", task="guard", epoch=3, tuning=GUARD.tuning), 10.0)
-    return Tenure(fleet=FLEET, me="r1", leases=leases(), executors={"guard": executor})
+    return Tenure(in_force=InForce(FLEET), me="r1", leases=leases(), executors={"guard": executor})
 
 
 def test_the_late_word_of_an_earlier_stop_does_not_give_back_the_lease_that_came_after_it() -> None:
@@ -446,7 +447,7 @@ def test_an_owner_that_is_asked_again_gives_back_at_once_when_its_worker_has_sto
     held = leases()
     executor = Executor(spec=GUARD, me="r1", has_streams=True)
     done(executor.execute, allocation_of(7, "r1", task="guard", epoch=3, tuning=GUARD.tuning), 10.0)
-    tenure = Tenure(fleet=FLEET, me="r1", leases=held, executors={"guard": executor})
+    tenure = Tenure(in_force=InForce(FLEET), me="r1", leases=held, executors={"guard": executor})
     for elector in ("r1", "r2"):
         held.on_beat(echo(elector, 5), {}, 10.01)
     roles, _ = tended(tenure, 5, 10.01)

@@ -81,7 +81,7 @@ def test_electors_die_one_after_another_and_are_replaced() -> None:
         play.sim.crash(play.electors()[0])
         play.reaches(left)
         play.owner_is_alive()
-    assert {play.sim.node(name).rounds.electors for name in play.sim.running()} == {play.electors()}
+    assert {play.sim.node(name).in_force.electors for name in play.sim.running()} == {play.electors()}
     assert set(play.electors()) == set(play.sim.running()), "all others are dead"
     play.sim.crash(play.electors()[0])
     play.owner_is_alive()

@@ -16,7 +16,8 @@ from support.todos import agreed
 from zsched.core.events import AcceptAsked, PrepareAsked
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.fleet import WorkerSpec, electorate_hash
+from zsched.core.values.fleet import Timing, WorkerSpec, electorate_hash
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import (
     Acceptance,
@@ -38,8 +39,7 @@ def proposer(incarnation: int = 4) -> TaskRegister:
         is_elector=True,
         initial=INITIAL,
         state=RegisterState(task="merge"),
-        ballot_s=0.3,
-        stagger_s=0.03,
+        clocks=lambda: Timing(ballot_s=0.3, stagger_s=0.03),
         rng=Random(1),
     )
 
@@ -116,7 +116,7 @@ def test_a_ballot_that_is_not_its_asker_s_or_a_stranger_s_gets_no_answer(node: s
     electorate = electorate_hash(fleet)
     state = state_of("r1", incarnation=1, electorate=electorate)
     elector = Agreement(
-        fleet=fleet, me="r1", durable=state, incarnation=1, electorate=electorate, rng=Random(1), now=0.0
+        in_force=InForce(fleet), me="r1", durable=state, incarnation=1, electorate=electorate, rng=Random(1), now=0.0
     )
     ballot = ballot_of(node=node)
     prepare = Prepare(task="merge", ballot=ballot, electorate=electorate)

@@ -12,6 +12,7 @@ from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import NodeId
 from zsched.core.vote.witness import ASK_ALL_S, Witness
@@ -219,8 +220,8 @@ def test_an_elector_that_forgets_nothing_is_judged() -> None:
 
 
 def witness(votes: int = 10) -> Witness:
-    nodes = frozenset((*ROBOTS, *EDGES))
-    return Witness(me="robot1", electors=ROBOTS, nodes=nodes, incarnation=7, votes=votes, started_at=100.0)
+    here = InForce(fleet_of(of=(*ROBOTS, *EDGES), electors=ROBOTS))
+    return Witness(me="robot1", electors=ROBOTS, in_force=here, incarnation=7, votes=votes, started_at=100.0)
 
 
 def told(by: NodeId, *seen: tuple[NodeId, int, int], votes: int = 0) -> Learnt:

@@ -11,6 +11,7 @@ from support.robots import Decider
 from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, Proposal, Reach
 from zsched.core.vote.tally import VoteOutcome, tally
 from zsched_lab.sim.simulator import Simulator
@@ -44,7 +45,7 @@ def test_an_escape_needs_a_majority_of_the_robots_that_are_not_gone(
 @pytest.mark.parametrize(("mine", "commits"), [("edge1", 0), ("edge2", 1)])
 def test_only_a_robot_that_voted_for_the_winner_commits_it(mine: str, commits: int) -> None:
     fleet = next(one.fleet for one in map(plan, range(1000)) if one.fleet.voters == VOTERS)
-    robot = Decider(fleet, "robot1", Gateway(fleet))
+    robot = Decider(fleet, "robot1", Gateway(InForce(fleet)))
     spec = fleet.task("merge")
     value = allocation_of(3, tuning=spec.tuning)
     states = dict.fromkeys((node.name for node in fleet.nodes), PeerState.ALIVE)

@@ -14,6 +14,7 @@ from zsched.core.instructions import SendAccept, SendPrepare
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, RoundOutcome
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 
@@ -23,6 +24,7 @@ INITIAL = allocation_of(0, None)
 BLANK = RegisterState(task="merge")
 FIRST = MoveOwner(base_revision=0, owner="e1", reason="test")
 BALLOT_S, STAGGER_S = 0.3, 0.03
+CLOCKS = Timing(ballot_s=BALLOT_S, stagger_s=STAGGER_S)
 
 
 def make(
@@ -34,6 +36,7 @@ def make(
     is_elector: bool | None = None,
     electors: tuple[str, ...] = ELECTORS,
     kind: type[TaskRegister] = TaskRegister,
+    clocks: Timing = CLOCKS,
 ) -> TaskRegister:
     """A register of one node."""
     return kind(
@@ -44,8 +47,7 @@ def make(
         is_elector=me in electors if is_elector is None else is_elector,
         initial=INITIAL,
         state=state,
-        ballot_s=BALLOT_S,
-        stagger_s=STAGGER_S,
+        clocks=lambda: clocks,
         rng=Random(1),
     )
 

@@ -10,6 +10,7 @@ from zsched.core.instructions import Instruction
 from zsched.core.scheduler.rounds import Rounds
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId
 from zsched.core.vote.voting import Votes
 
@@ -18,8 +19,8 @@ class Decider:
     """Gathers, judges, proposes and votes for one robot; no register, no executor."""
 
     def __init__(self, fleet: Fleet, me: NodeId, gateway: Gateway, seed: int = 1, now: float = 0.0) -> None:
-        self.votes = Votes(fleet, me)
-        self.rounds = Rounds(fleet, me, gateway, self.votes.tasks, Random(seed), now)
+        self.votes = Votes(InForce(fleet), me)
+        self.rounds = Rounds(InForce(fleet), me, gateway, self.votes.tasks, Random(seed), now)
         self.tasks = self.rounds.tasks
 
     def next_deadline(self) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 
 from zsched.core.instructions import Instruction
 from zsched.core.todo import ToDo
+from zsched.core.values.fleet import Fleet
 from zsched.core.vote.agreement import Agreement
 
 
@@ -27,6 +28,12 @@ def agreed(call: Callable[..., None], *args: Any) -> ToDo:
     for ended in todo.ended:
         agreement.on_ended(ended, todo)
     return todo
+
+
+def under(agreement: Agreement, fleet: Fleet, now: float) -> ToDo:
+    """Another fleet is in force."""
+    agreement._in_force.take(fleet)
+    return agreed(agreement.on_fleet, now)
 
 
 def done(call: Callable[..., None], *args: Any) -> tuple[Instruction, ...]:

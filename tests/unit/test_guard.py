@@ -14,7 +14,7 @@ import pytest
 
 import zsched
 from zsched import guard
-from zsched.guard import all_end_within, ends_within, guarded, running
+from zsched.guard import ends_within, guarded
 from zsched.log_limit import LIBRARY, MAX_PLACES, LogLimit, PlainLines, limit_library
 from zsched.log_limit import LIMIT as SHARED
 
@@ -318,25 +318,3 @@ def test_what_hangs_is_not_waited_for_longer_than_its_time() -> None:
         assert 0.05 <= time.monotonic() - began_at < 5.0
     finally:
         hanging.set()
-
-
-def test_the_end_of_our_threads_is_awaited_and_of_no_other() -> None:
-    stays, goes, before = threading.Event(), threading.Event(), running()
-    earlier = guarded(stays.wait, name="earlier", is_lasting=False)
-    foreign = threading.Thread(target=stays.wait)
-    earlier.start()
-    foreign.start()
-    known = running()
-    assert known - before == {earlier}
-    ours = guarded(goes.wait, name="ours", is_lasting=False)
-    ours.start()
-    try:
-        assert not all_end_within(0.01, besides=known)
-        goes.set()
-        assert all_end_within(10.0, besides=known)
-        assert not ours.is_alive()
-    finally:
-        goes.set()
-        stays.set()
-        foreign.join(10.0)
-        earlier.join(10.0)

@@ -76,7 +76,7 @@ class Node(Stages):
         todo.must_persist = self.agreement.must_persist
         todo.add(*self.agreement.at_start.send)
         fleet.compare_file(self)
-        documents.count_voters(self)
+        documents.count_voters(self, todo)
         for name, executor in self.executors.items():
             executor.start(todo)
             value = self.registers[name].value

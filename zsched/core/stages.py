@@ -49,7 +49,8 @@ from zsched.core.scheduler.unseen import Unseen
 from zsched.core.todo import ToDo
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
-from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
+from zsched.core.values.fleet import Fleet, TaskSpec, file_hash
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, NodeKind, PeerState, TaskId
 from zsched.core.values.plan import StreamCount, WorkerRole
 from zsched.core.values.problems import Problem, ProblemKey
@@ -150,37 +151,35 @@ class Stages:
         stored: Mapping[str, Fleet] = MappingProxyType({}),
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
-        fleet = known_at_start(fleet, durable, stored)
-        self.fleet, self.me, self.version = fleet, me, version
+        self.in_force = InForce(known_at_start(fleet, durable, stored))
+        fleet = self.fleet
+        self.me, self.version = me, version
         self.kind = fleet.node(me).kind
         self.incarnation = incarnation
         self.started_at = now
         self.has_state = durable is not None
         self.told_fleet = fleet
         """The newest fleet file that was given to the runtime; what of it is in force is `fleet`."""
-        self.fleet_file = fleet_hash(fleet)
-        self.text_hash = file_hash(fleet)
-        """Hash of it as its text says it, without rollouts."""
         self.by_file = self.text_hash
         """Hash of what that file says; once a document is agreed, the node does not go by the file."""
         self.counters: Counter[str] = Counter()
         self.problems: dict[ProblemKey, str] = {}
-        self.history: dict[TaskId, deque[PastValue]] = {task.name: deque(maxlen=HISTORY) for task in fleet.tasks}
+        self.history: dict[TaskId, deque[PastValue]] = self.in_force.by_task(lambda _name: deque(maxlen=HISTORY))
 
         # PROFILE, GATEWAY
         self.profiler = Profiler(me, incarnation, fleet.timing)
         self.relay_ends = RelayEnds()
-        self.gateway = Gateway(fleet)
+        self.gateway = Gateway(self.in_force)
         self.round_trips = RoundTrips(me)
         # SCHEDULER, VOTE
-        self.votes = Votes(fleet, me)
-        self.probation, self.unseen = Probation(fleet), Unseen()
+        self.votes = Votes(self.in_force, me)
+        self.probation, self.unseen = Probation(self.in_force), Unseen(self.in_force)
         self.flags = NodeFlags(rank=[node.name for node in fleet.nodes].index(me))
         self.rounds = Rounds(
-            fleet, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips, self.flags
+            self.in_force, me, self.gateway, self.votes.tasks, rng, now, self._doubts, self.round_trips, self.flags
         )
         self.agreement = Agreement(
-            fleet=fleet,
+            in_force=self.in_force,
             me=me,
             durable=durable,
             incarnation=incarnation,
@@ -194,11 +193,11 @@ class Stages:
         self.unconfirmed: dict[TaskId, str] = {}
         """{task whose stored value is not carried out yet: how it is known}."""
         self.disks = Disks()
-        self.retuning = Retuning(me)
+        self.retuning = Retuning(me, self.in_force)
         self.expiry = Expiry(rank=self.flags.rank)
         self.flags.take(self.agreement.flags, now)
         self._begin_work(fleet, now)
-        self._begin_membership(fleet, now)
+        self._begin_membership(now)
         self._todo = ToDo()
 
     def _begin_work(self, fleet: Fleet, now: float) -> None:
@@ -212,41 +211,58 @@ class Stages:
         self.renewing = Renewing(me)
         self.rollouts = Rollouts()
         self.rollouts.take(fleet, now)
-        self.hangs = HangWatch(fleet)
+        self.hangs = HangWatch(self.in_force)
         self.recent_lag = RecentWorst(LAG_SHOWN_S)
         leases = self.agreement.leases
-        self.tenure = Tenure(fleet, me, leases, self.executors)
-        self.sealing = Sealing(fleet, me, self.executors, leases.over_at, lambda: leases.terms)
+        self.tenure = Tenure(self.in_force, me, leases, self.executors)
+        self.sealing = Sealing(self.in_force, me, self.executors, leases.over_at, lambda: leases.terms)
         self.missed: dict[str, tuple[int, float | None]] = {}
         """{stream: (how many of its samples somebody may miss, when that last rose; ``None``: before we started)}."""
         self.rates = StreamRates()
         self.gaps = StreamGaps()
         self.killed_at: dict[TaskId, float] = {}
         """{task: when our worker was last killed for a rehearsal}."""
-        self.unready: dict[TaskId, Unready] = {}
+        self.unready: dict[TaskId, Unready] = self.in_force.by_task()
         """The slots whose worker our relay does not see, or not any more."""
 
-    def _begin_membership(self, fleet: Fleet, now: float) -> None:
+    def _begin_membership(self, now: float) -> None:
         """Who is there, who this node is to them, and when to beat."""
-        me = self.me
-        self.membership = Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
-        self.identity = Identity(me, self.incarnation, self.fleet_file, now, fleet.timing.beat_s)
-        self.namesakes = Namesakes(fleet.timing.rest_beat_s)
-        self.knocking = Knocking(self.fleet_file)
+        me, here = self.me, self.in_force
+        self.membership = Membership(me, here)
+        self.identity = Identity(me, here, self.incarnation, now)
+        self.namesakes = Namesakes(here)
+        self.knocking = Knocking(here)
         self.refused_keys = RefusedKeys()
         self.introductions, self.mute_links = Introductions(), MuteLinks()
-        self.solitude = Solitude(timing=fleet.timing, started_at=now)
+        self.solitude = Solitude(in_force=here, started_at=now)
         self.quorum_at = now
         """When this node last knew a majority of the electors to answer; its start, if never."""
         self.dropped_at = {}
-        self.stateless: set[NodeId] = set()
+        self.stateless: dict[NodeId, None] = here.by_node()
         """Electors whose newest beat says that they answer no proposer."""
-        self.fileless: set[NodeId] = set()
+        self.fileless: dict[NodeId, None] = here.by_node()
         """Those of them that have no state file at all."""
         self.beat_room = BeatRoom()
         self.beat_at = now
         """When the next beat is due that nothing brings forward."""
-        self.pace = Pace(timing=fleet.timing)
+        self.pace = Pace(in_force=here)
+
+    # --- the fleet in force ----------------------------------------------------------------------------------------
+
+    @property
+    def fleet(self) -> Fleet:
+        """What this node goes by."""
+        return self.in_force.fleet
+
+    @property
+    def fleet_file(self) -> str:
+        """Its hash."""
+        return self.in_force.file
+
+    @property
+    def text_hash(self) -> str:
+        """Hash of it as its text says it, without rollouts."""
+        return file_hash(self.fleet)
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
@@ -334,7 +350,7 @@ class Stages:
             for_s = confirm_s if node == owner else 0.0
             return misses(node, elector, now, for_s) or misses(elector, node, now, for_s)
 
-        return self.agreement.leases.unfit(self.fleet.task(task).candidates, self.stateless, are_apart)
+        return self.agreement.leases.unfit(self.fleet.task(task).candidates, self.stateless.keys(), are_apart)
 
     def resting(self, now: float) -> Mapping[TaskId, str]:
         """{exclusive task that this node owns and may not work on: why}, once that lasts. For every turn."""
@@ -390,10 +406,7 @@ class Stages:
 
     def tend_disks(self) -> None:
         """Somebody has told how long a save takes: the clocks of votes leave room for it."""
-        pace_s = self.disks.pace_s(self.me, self.agreement.electors)
-        if pace_s != self.agreement.pace_s:
-            self.agreement.pace(pace_s)
-            self.votes.pace(self.agreement.timing)
+        self.in_force.pace(self.disks.pace_s(self.me, self.agreement.electors))
 
     def counts_age_s(self, now: float) -> float:
         """For how long the relay has told no counts; 0 before the first."""

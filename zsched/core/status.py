@@ -252,7 +252,7 @@ def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:
     """The electors on which `init` was only forgotten, as far as is known: no file, no vote that anybody remembers."""
     if node.agreement.newest_generation:
         return []
-    fileless = node.fileless | ({node.me} if node.lacks_state_file else set())
+    fileless = node.fileless.keys() | ({node.me} if node.lacks_state_file else set())
     return [name for name in quorum.stateless if name in fileless and name not in node.agreement.voted]
 
 

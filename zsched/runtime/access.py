@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.values.fleet import Fleet, LocalSide, NodeSpec
+from zsched.core.values.fleet import LocalSide, NodeSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
 from zsched.runtime.own_addresses import dialled_here
 from zsched.sessions import config as zenoh_config
@@ -21,15 +22,11 @@ Json = dict[str, Any]
 class StreamAccess:
     """The ways from this machine to the streams of any node of the fleet."""
 
-    def __init__(self, fleet: Fleet, me: NodeId, own_endpoints: tuple[str, ...], operator_json5: str) -> None:
+    def __init__(self, in_force: InForce, me: NodeId, own_endpoints: tuple[str, ...], operator_json5: str) -> None:
         """``own_endpoints``: where this node's relay is dialled on this machine."""
-        self._fleet, self._me = fleet, me
+        self._in_force, self._me = in_force, me
         self._own = own_endpoints
         self._operator_json5 = operator_json5
-
-    def adopt(self, fleet: Fleet) -> None:
-        """Answer by another fleet file from now on."""
-        self._fleet = fleet
 
     def answer(self, node: NodeId) -> Json:
         """``{"sides": {name: zenoh configuration}, "via": node}`` or ``{"error": ...}``.
@@ -37,10 +34,11 @@ class StreamAccess:
         Where the fleet file gives a node no address, this node's own relay is the way: it sees all but what stays on
         that node's local side.
         """
-        names = [spec.name for spec in self._fleet.nodes]
+        fleet = self._in_force.fleet
+        names = [spec.name for spec in fleet.nodes]
         if node not in names:
-            return {"error": f"fleet {self._fleet.name} has no node {node!r}; there are {', '.join(names)}"}
-        spec = self._fleet.node(node)
+            return {"error": f"fleet {fleet.name} has no node {node!r}; there are {', '.join(names)}"}
+        spec = fleet.node(node)
         is_direct = node == self._me or bool(spec.data_at)
         connect = self._own if node == self._me or not spec.data_at else (spec.data_at,)
         sides = {"fleet": self._config(connect, self._operator_json5)}
@@ -50,7 +48,7 @@ class StreamAccess:
 
     def _config(self, connect: tuple[str, ...], operator_json5: str) -> str:
         return zenoh_config.client_config(
-            connect=connect, timing=self._fleet.timing, shared_memory=False, operator_json5=operator_json5
+            connect=connect, timing=self._in_force.timing, shared_memory=False, operator_json5=operator_json5
         )
 
 

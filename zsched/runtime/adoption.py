@@ -18,12 +18,11 @@ from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import watch_for
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct, field
-from zsched.runtime.access import StreamAccess
 from zsched.runtime.access_rules import names_of
 from zsched.runtime.crew import Crew
-from zsched.runtime.desk import Desk
 from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
@@ -36,18 +35,18 @@ SOURCE = "restart"
 _log = logging.getLogger("zsched.daemon")
 
 
-def tell_orders(fleet: Fleet, desk: Desk, bus: ControlBus) -> None:
-    """Whose orders count from now on, those of this machine among them, and how long the desk waits for their end."""
-    security = fleet.security
-    desk.adopt(fleet.timing, None if security is None else security.orders)
-    if security is not None:
-        bus.take_orders_of(orderers_of(fleet, security))
+def tell_orders(fleet: Fleet, bus: ControlBus) -> None:
+    """Whose orders count from now on."""
+    if fleet.security is not None:
+        bus.take_orders_of(orderers_of(fleet, fleet.security))
 
 
 class Adoption(Struct, kw_only=True):
     """The adapters of one daemon that follow the fleet file."""
 
     me: NodeId
+    here: InForce
+    """What the desk and the ways to streams go by."""
     started_with: Fleet
     points: Endpoints
     """Where its sessions listen and which nodes they dial, since the start."""
@@ -57,8 +56,6 @@ class Adoption(Struct, kw_only=True):
     supervisor: WorkerSupervisor
     relay: RelayHandle
     bus: ControlBus
-    access: StreamAccess
-    desk: Desk
     post: Callable[[ev.Event], None]
     sampler: Sampler
     compare_sessions: Callable[[bool, tuple[NodeId, ...]], None]
@@ -69,7 +66,7 @@ class Adoption(Struct, kw_only=True):
         """Tell the relay what it watches, by the file that the daemon starts with."""
         self._tell_watches(self.started_with)
 
-    def adopt(self, fleet: Fleet, is_agreed: bool = False) -> None:
+    def follow(self, fleet: Fleet, is_agreed: bool = False) -> None:
         """Follow another file of the same fleet, which names this node with the same kind.
 
         Args:
@@ -84,16 +81,16 @@ class Adoption(Struct, kw_only=True):
             fleet, fleet.node(self.me), lambda: Endpoint.of(listen).port or 1, protocol=self.protocol
         )
         connect = (self.points.worker_connect[0], *points.worker_connect[1:])
-        self.recipes.adopt(fleet, connect, dials_by_gossip=points.worker_by_gossip)
+        self.recipes.make(fleet, connect, dials_by_gossip=points.worker_by_gossip)
         _log.info("fleet_file node=%s: adapters follow another one", self.me)
-        self.crew.adopt(fleet, self.recipes.paths)
-        self.supervisor.adopt(self.recipes.specs)
+        self.crew.on_fleet(fleet, self.recipes.paths)
+        self.supervisor.keep(self.recipes.specs)
         self.crew.keep(self.recipes.specs)
-        self.access.adopt(fleet)
+        self.here.take(fleet)
         is_exclusive = any(task.exclusive for task in fleet.tasks)
-        self.sampler.adopt(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
+        self.sampler.measure(fleet.node(self.me), fleet.timing.sample_s, is_watched=is_exclusive)
         self.bus.know(names_of(fleet), limit_for(fleet.timing, len(fleet.tasks)))
-        tell_orders(fleet, self.desk, self.bus)
+        tell_orders(fleet, self.bus)
         if is_exclusive:
             self.bus.hear_all_at_once()
         self._tell_watches(fleet)

@@ -81,7 +81,7 @@ class Crew:
         self._matching = frozenset(task.name for task in tasks if task.worker.ready_when is ReadyWhen.MATCHING)
         self._foreign = frozenset(task.name for task in tasks if not task.worker.command)
 
-    def adopt(self, fleet: Fleet, sessions: Mapping[TaskId, Path]) -> None:
+    def on_fleet(self, fleet: Fleet, sessions: Mapping[TaskId, Path]) -> None:
         """Take from another fleet file which workers show themselves how, and which ones somebody else starts."""
         known = self._foreign
         with self._lock:

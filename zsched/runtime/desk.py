@@ -17,7 +17,7 @@ from zsched.core import events as ev
 from zsched.core.report import plain, snapshot_json
 from zsched.core.values.decision import Decision, Explanation
 from zsched.core.values.document import Document, Flag, Rollout, Text
-from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
     Agreed,
     Asking,
@@ -62,6 +62,7 @@ class Desk:
         node: NodeId,
         inbox: Inbox,
         bus: ControlBus,
+        in_force: InForce,
         access: Callable[[NodeId], dict[str, Any]] | None = None,
         log: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
         leave: Callable[[], None] | None = None,
@@ -75,12 +76,7 @@ class Desk:
         self._numbers = itertools.count(LOCAL_REQUESTS_FROM)
         self._waiting: dict[int, queue.SimpleQueue[object]] = {}
         self._lock = threading.Lock()
-        self._order_s = Timing().order_s
-        self._orders_of: tuple[NodeId, ...] | None = None
-
-    def adopt(self, timing: Timing, orders_of: tuple[NodeId, ...] | None = None) -> None:
-        """Go by the clocks of the fleet that is in force from now on; any thread."""
-        self._order_s, self._orders_of = timing.order_s, orders_of
+        self._in_force = in_force
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request of the socket (``status``, ``explain``, ``log``, ``move``, ...).
@@ -113,10 +109,12 @@ class Desk:
         return {"error": f"unknown verb {verb!r:.80}; known: {known}"}
 
     def _ask(self, node: NodeId, command: Command | None) -> dict[str, Any]:
-        within_s = self._order_s if isinstance(command, Agreed) else ANSWER_TIMEOUT_S
+        fleet = self._in_force.fleet
+        within_s = fleet.timing.order_s if isinstance(command, Agreed) else ANSWER_TIMEOUT_S
+        orders_of = None if fleet.security is None else fleet.security.orders
         is_order = command is not None and not isinstance(command, Asking)
-        if is_order and self._orders_of is not None and self._node not in self._orders_of:
-            others = f"{' and '.join(self._orders_of) or 'no node'} may (`security: {{orders: [...]}}`)"
+        if is_order and orders_of is not None and self._node not in orders_of:
+            others = f"{' and '.join(orders_of) or 'no node'} may (`security: {{orders: [...]}}`)"
             instead = "order there, or by an operator's certificate with --connect"
             return {"error": f"{self._node} gives no orders in this fleet, {others}; {instead}"}
         if node != self._node:

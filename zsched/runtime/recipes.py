@@ -86,7 +86,7 @@ class Recipes:
         """Who starts a task's worker, as another user; ``None``: the daemon."""
         return self._made.starters.get(task)
 
-    def adopt(self, fleet: Fleet, connect: tuple[str, ...], *, dials_by_gossip: bool) -> None:
+    def make(self, fleet: Fleet, connect: tuple[str, ...], *, dials_by_gossip: bool) -> None:
         """Make the recipes of a fleet file, and write the session files that have changed.
 
         Args:

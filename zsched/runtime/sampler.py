@@ -72,7 +72,7 @@ class Sampler:
         if self._wait_s > self._pace.period_s:
             self._wake.set()
 
-    def adopt(self, spec: NodeSpec, period_s: float, *, is_watched: bool = True) -> None:
+    def measure(self, spec: NodeSpec, period_s: float, *, is_watched: bool = True) -> None:
         """Measure these links, at this pace, from the next time on."""
         self._pace.period_s, self._is_watched = period_s, is_watched
         if spec.links != self._links:

@@ -125,7 +125,7 @@ class SessionWatch:
                 node.set_problem(Problem.CERTIFICATE, renewal.problem(self._fleet, renewal.now_utc()))
             if self._lets_in_others or left or self._has_another_certificate(node):
                 candidates = [task.candidates for task in node.fleet.tasks]
-                order = turns((*alive, node.me), electors, node.tenure.voters, candidates)
+                order = turns((*alive, node.me), electors, node.in_force.voters, candidates)
                 self._reopening.want(order, lives, now, first_s=first_wait_s(node.fleet.timing))
             elif not self._has_roamed:
                 self._reopening.forget()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from zsched_lab.bugs.core_bugs import Bug
 
-FLEET = "zsched.core.handlers.fleet"
+IN_FORCE = "zsched.core.values.in_force"
 AGREEMENT, LEASE = "zsched.core.vote.agreement", "zsched.core.vote.lease"
 RENEWING, RETUNING = "zsched.core.executor.renewing", "zsched.core.vote.retuning"
 ADOPTION, HANDOVER = "zsched.core.values.adoption", "zsched.core.executor.handover"
@@ -38,17 +38,16 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
     ),
     _bug(
         "membership keeps the nodes of the file before",
-        FLEET,
-        "    node.membership.adopt(tuple(one.name for one in fleet.nodes), fleet.timing)\n",
-        "",
+        IN_FORCE,
+        "            _fit(nodes, make, [name for name in self.nodes if name != but])\n",
+        "            pass\n",
         _FLEET,
     ),
     _bug(
         "robots vote as by the file before",
-        FLEET,
-        "    node.votes.adopt(fleet)\n",
-        "    known = {one.name for one in fleet.tasks}\n"
-        "    for name in {*node.votes.tasks} - known:\n        node.votes.tasks.pop(name)\n",
+        IN_FORCE,
+        "        self.voters = fleet.voters\n",
+        "        self.voters = getattr(self, 'voters', fleet.voters)\n",
         _FLEET,
     ),
     _bug(
@@ -88,9 +87,9 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
     ),
     _bug(
         "the register of the fleet keeps the clocks of before",
-        "zsched.core.electorate.roll",
-        "        self._register.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)\n",
-        "",
+        "zsched.core.electorate.numbers",
+        "        return self._here.timing\n",
+        "        return self.__dict__.setdefault('_first', self._here.timing)\n",
         _CHANGES,
     ),
     _bug(

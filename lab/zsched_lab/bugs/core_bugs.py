@@ -292,7 +292,7 @@ REGISTER_BUGS = (
     _bug(
         "ballot in another's name is answered",
         ACCEPTOR,
-        "return ballot.node == asker and asker in self._nodes",
+        "return ballot.node == asker and asker in self._in_force.nodes",
         "return True",
         _REGISTER,
         13,
@@ -501,7 +501,7 @@ LEASE_BUGS = (
     _bug(
         "restart forgets a longer lease",
         LEASE,
-        "hold_s(max(self.fleet.timing.lease_s, self.granted_s))",
+        "hold_s(max(self.in_force.timing.lease_s, self.granted_s))",
         "hold_s(self.fleet.timing.lease_s)",
         _ROLLOUT,
     ),
@@ -664,7 +664,7 @@ MEMBERSHIP_BUGS = (
     _bug(
         "who is overtaken ends the accept that waits",
         REGISTER,
-        "now < (until := min(self._lease_over_at, running.give_up_at))",
+        "now < (until := min(self._lease_over_at, self._gives_up_at(running)))",
         "now < (until := -math.inf)",
         ("tests/unit/core/register/test_register_proposer.py", "tests/sim/test_exclusive.py"),
     ),
@@ -873,7 +873,7 @@ VOTE_BUGS = (
     _bug(
         "a robot at rest goes by its first answers for ever",
         ROUNDS,
-        " or now >= kept.at + self._fleet.timing.profile_ttl_s",
+        " or now >= kept.at + self._in_force.timing.profile_ttl_s",
         "",
         _ROUNDS,
     ),

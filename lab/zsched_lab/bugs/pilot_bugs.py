@@ -149,15 +149,15 @@ PILOT_BUGS: tuple[Bug, ...] = (
     _node_bug(
         "a node that starts counts the robots of its document",
         "zsched.core.node",
-        ("        documents.count_voters(self)\n", ""),
+        ("        documents.count_voters(self, todo)\n", ""),
     ),
     Bug(
         name="rounds go by the electors of the file",
         module="zsched.core.handlers.documents",
         changes=(
             (
-                "node.rounds.count_with(voters, node.agreement.electors)",
-                "node.rounds.count_with(voters, node.rounds.electors)",
+                "node.in_force.count(node.agreement.voters, node.agreement.electors)",
+                "node.in_force.count(node.agreement.voters, node.in_force.electors)",
             ),
         ),
         tests=("tests/unit/core/electorate/test_strangers.py",),

@@ -20,6 +20,7 @@ from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import Standing, compare, reaches_owner
 from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, UtilityVector
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource
 from zsched_lab.decisions.world import DT_S, MEMORY_MB, World
@@ -68,7 +69,7 @@ class Feed:
         smoothing_s = max(look.smoothing_s, 1e-9)
         self.fleet: Fleet = replace(world.fleet, timing=replace(world.fleet.timing, smoothing_s=smoothing_s))
         self._world = world
-        self.gateway = Gateway(self.fleet)
+        self.gateway = Gateway(InForce(self.fleet))
         self._profilers = {node.name: Profiler(node.name, 1, self.fleet.timing) for node in self.fleet.nodes}
         self._column = {name: index for index, name in enumerate(world.candidates)}
         self._row = {name: index for index, name in enumerate(self.fleet.voters)}

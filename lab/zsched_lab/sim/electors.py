@@ -19,14 +19,14 @@ from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner, Rewrite, RoundOutcome
 from zsched.core.values.electorate import Creation, Elector, FleetValue
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId, Tuning, Weights
 from zsched.core.values.struct import replace
 from zsched.core.values.words import CREATION_STEP
 from zsched_lab.sim.chosen import Chosen
 
-BALLOT_S: Final = 0.3
-STAGGER_S: Final = 0.03
+CLOCKS: Final = Timing(ballot_s=0.3, stagger_s=0.03)
 FLEET: Final = "swarm"
 TUNING: Final = Tuning(weights=Weights(cpu=1.0, memory=0.0, network=0.0))
 
@@ -196,8 +196,7 @@ class Machines:
             state=state,
             registers=machine.registers,
             begin=lambda creation: self._register(machine, creation, None),
-            ballot_s=BALLOT_S,
-            stagger_s=STAGGER_S,
+            clocks=lambda: CLOCKS,
             rng=self.rng,
             now=machine.now,
         )
@@ -211,8 +210,7 @@ class Machines:
             is_elector=False,
             initial=self.first_value(creation),
             state=stored or RegisterState(task=creation.task, creation=creation.number),
-            ballot_s=BALLOT_S,
-            stagger_s=STAGGER_S,
+            clocks=lambda: CLOCKS,
             rng=self.rng,
             disk=machine.disk.id,
         )

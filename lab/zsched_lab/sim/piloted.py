@@ -26,6 +26,7 @@ from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner, RoundOutcome
 from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet, TaskSpec, Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Accepted, Refusal
 from zsched.core.values.model import Allocation, NodeId, NodeKind, RegisterState, TaskId
 from zsched.core.vote.lease import Leases
@@ -118,13 +119,13 @@ class Piloted(Machines):
         machine.now = self.time
         is_elector = machine.roll is not None and machine.roll.is_elector
         leases = Leases(
-            fleet=self._fleet,
+            in_force=InForce(self._fleet),
             me=machine.name,
             incarnation=machine.disk.incarnation,
             standing=_standing(machine) if is_elector else {},
             now=self.time,
         )
-        pilot = Pilot(me=machine.name, disk=machine.disk.id, stagger_s=STAGGER_S, now=self.time)
+        pilot = Pilot(me=machine.name, disk=machine.disk.id, now=self.time)
         beat_at = self.time + BEAT_S * self.rng.random()
         self.lives[id(machine)] = Life(pilot=pilot, leases=leases, beat_at=beat_at)
         self._note(machine)
@@ -228,7 +229,7 @@ class Piloted(Machines):
         for name in dict.fromkeys(one.name for one in self.machines):
             if name != machine.name:
                 self._send_beat(machine, name, beat)
-        change = life.pilot.tick(value, course, now, is_busy=roll.is_busy)
+        change = life.pilot.tick(value, course, now, stagger_s=STAGGER_S, is_busy=roll.is_busy)
         if change is not None:
             self.propose(machine, change)
 

@@ -80,7 +80,9 @@ class Scene:
     def settle(self, route: Route = IN, ready: ReadyWhen = ReadyWhen.TOKEN) -> None:
         slot = Slot(epoch=3, owner="edge1", routes=(route,), ready_when=ready)
         self.task.apply(RoutePlan(task="t", phase=RoutePhase.CLOSE, current=slot))
-        until(lambda: (source := self.streams.inputs.get(IN.stream)) is not None and source.has_way, "the way")
+        until(
+            lambda: (source := self.streams.inputs.get(IN.stream)) is not None and source._active is not None, "the way"
+        )
 
     def put(self, count: int) -> None:
         before = self.count().messages
@@ -349,7 +351,7 @@ def test_what_no_thread_was_to_be_had_for_is_opened_later(
         until(lambda: any(isinstance(word, ProblemReported) for word in scene.words), "the problem")
     names = {"t/in/0", "t/out/0", "t/srv/0"}
     until(lambda: {one.stream for one in scene.task.counts()} == names, "the streams", 5.0)
-    until(lambda: scene.streams.inputs[IN.stream].has_way, "the way", 5.0)
+    until(lambda: scene.streams.inputs[IN.stream]._active is not None, "the way", 5.0)
     source, owner = other.declare_publisher("robot1/in"), other.declare_publisher("edge1/t/3/robot1/out")
     asker = other.declare_querier("robot1/ask")
     for end in (source, owner, asker):

@@ -258,7 +258,7 @@ def test_nobody_is_told_of_a_worker_that_this_node_keeps_no_more(house: House) -
 def test_nor_of_one_that_this_node_starts_from_now_on(house: House) -> None:
     house.match("others", is_certain=False)
     worker = WorkerSpec(command=("work",), ready_when=ReadyWhen.MATCHING)
-    house.crew.adopt(fleet_of(task_of("others", ("edge1",), worker=worker), of=["edge1"], electors=["edge1"]), {})
+    house.crew.on_fleet(fleet_of(task_of("others", ("edge1",), worker=worker), of=["edge1"], electors=["edge1"]), {})
     assert house.problems() == [("worker/others", OTHERS), ("worker/others", None)]
 
 
@@ -375,8 +375,8 @@ def test_who_has_to_start_a_worker_with_a_token_is_told_its_key(house: House) ->
 def adopt(house: House, *tasks: str) -> None:
     """Go by a file that has these tasks only, as `zsched.runtime.adoption` does."""
     specs = {name: SPECS[name] for name in tasks}
-    house.crew.adopt(replace(FLEET, tasks=tuple(one for one in FLEET.tasks if one.name in tasks)), {})
-    house.supervisor.adopt(specs)
+    house.crew.on_fleet(replace(FLEET, tasks=tuple(one for one in FLEET.tasks if one.name in tasks)), {})
+    house.supervisor.keep(specs)
     house.crew.keep(specs)
 
 
@@ -462,17 +462,17 @@ def test_a_match_that_comes_before_the_supervisor_has_heard_of_the_task_counts(h
     """The relay tells it once, and may be quicker than the supervisor's thread."""
     adopt(house, "alone")
     until(lambda: "others" not in house.supervisor.states(), "the task is away")
-    house.crew.adopt(FLEET, {})
+    house.crew.on_fleet(FLEET, {})
     house.crew.keep(SPECS)
     house.match("others")
-    house.supervisor.adopt(SPECS)
+    house.supervisor.keep(SPECS)
     assert house.states("others") == [WorkerState.READY]
 
 
 def test_a_late_start_of_ours_hides_no_worker_that_somebody_else_starts_now(house: House) -> None:
     """The supervisor's thread hears later than the crew that the task has no `command` any more."""
     tasks = tuple(replace(one, worker=WorkerSpec()) if one.name == "token" else one for one in FLEET.tasks)
-    house.crew.adopt(replace(FLEET, tasks=tasks), {})
+    house.crew.on_fleet(replace(FLEET, tasks=tasks), {})
     house.crew.on_started("token", 7, 100001)
     house.crew.on_exited("token", 100001, -2, "stopped by SIGINT")
     assert house.states("token") == []

@@ -36,6 +36,7 @@ from zsched.core.values.decision import Explanation, Move
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import MOST_ORDER_S, Fleet, Timing, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -111,7 +112,8 @@ class House:
         self.adapter = cast("Any", Adapter(self.calls))
         self.inbox = Inbox()
         self.state_file = StateFile(folder, fleet="f", node="robot1", hardware="")
-        self.desk = Desk("robot1", self.inbox, self.adapter)
+        self.here = InForce(fleet_of())
+        self.desk = Desk("robot1", self.inbox, self.adapter, self.here)
         self.shell = Shell(
             node="robot1", inbox=self.inbox, bus=self.adapter, state_file=self.state_file, desk=self.desk
         )
@@ -446,7 +448,7 @@ def test_a_program_on_this_machine_orders_in_no_operator_s_and_no_other_node_s_n
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_values, "LEAST_ORDER_S", 0.001)
-    house.desk.adopt(Timing(ballot_s=0.01))
+    house.here.take(replace(fleet_of(), timing=Timing(ballot_s=0.01)))
     for said, told in (
         ({"by": "ada@robot1"}, "ada@robot1"),
         ({"by": "ana.operator"}, "ana.operator@robot1"),
@@ -461,19 +463,19 @@ def test_a_program_on_this_machine_orders_in_no_operator_s_and_no_other_node_s_n
 
 def test_a_node_that_may_give_no_orders_says_so_and_still_asks(house: House) -> None:
     """A worker that reached the socket of its node could order what it liked."""
-    house.desk.adopt(Timing(), ("robot2", "robot3"))
+    house.here.take(fleet_of(security=fleet_values.Security(folder="pki", orders=("robot2", "robot3"))))
     for request in ({"verb": "change", "text": "x"}, {"verb": "change", "text": "x", "node": "robot2"}):
         said = house.desk.answer({"by": "eve@robot1", **request})["error"]
         assert said.startswith("robot1 gives no orders in this fleet, robot2 and robot3 may (`security: {orders: [")
     assert house.events() == []
-    house.desk.adopt(Timing(), ("robot1",))
+    house.here.take(fleet_of(security=fleet_values.Security(folder="pki", orders=("robot1",))))
     house.desk.answer({"verb": "restart", "task": "merge"})
     assert [type(event) for event in house.events()] == [ev.RestartCommanded]
 
 
 def test_a_daemon_is_ended_for_good_on_its_own_machine_only(house: House) -> None:
     ended: list[str] = []
-    desk = Desk("robot1", house.inbox, house.adapter, leave=lambda: ended.append("robot1"))
+    desk = Desk("robot1", house.inbox, house.adapter, house.here, leave=lambda: ended.append("robot1"))
     told = desk.answer({"verb": "leave", "node": "edge1"})
     assert (told, ended) == ({"error": "edge1 leaves by a command on its own machine: zsched leave"}, [])
     assert (desk.answer({"verb": "leave"}), ended) == ({"outcome": "ok"}, ["robot1"])
@@ -633,7 +635,7 @@ def test_an_order_that_the_loop_tells_no_end_of_may_have_been_carried_out(
 ) -> None:
     monkeypatch.setattr(fleet_values, "LEAST_ORDER_S", 0.001)
     monkeypatch.setattr("zsched.runtime.desk.ANSWER_TIMEOUT_S", 0.05)
-    house.desk.adopt(Timing(ballot_s=0.01))
+    house.here.take(replace(fleet_of(), timing=Timing(ballot_s=0.01)))
     why = "the decision loop of robot1 did not answer within"
     for order, within_s in (
         ({"verb": "hold", "task": "merge", "hold": "pause", "by": "ada@robot1"}, 0.14),
@@ -655,7 +657,7 @@ def test_desk_asks_other_nodes_over_the_bus_and_hands_its_errors_on(house: House
         raise AdapterError(f"{node} did not answer within {within_s:g} s; is it up and reachable?") from silence
 
     house.desk._bus = SimpleNamespace(ask_node=ask_node)  # type: ignore[assignment]
-    house.desk.adopt(WAN)
+    house.here.take(replace(fleet_of(), timing=WAN))
     tune = {"verb": "tune", "task": "merge", "tuning": TUNING, "base_revision": 3, "by": "ada@robot1"}
     assert house.desk.answer({**tune, "node": "edge1"})["outcome"] == "ok"
     for node in ("edge2", "edge3"):

@@ -20,6 +20,7 @@ from zsched.commands.ask import Door
 from zsched.commands.common import CliError
 from zsched.commands.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates, show_rates
 from zsched.core.values.fleet import Cell, LocalSide
+from zsched.core.values.in_force import InForce
 from zsched.runtime.access import StreamAccess
 
 
@@ -164,7 +165,7 @@ FLEET = fleet_of(
 
 
 def access(me: str) -> StreamAccess:
-    return StreamAccess(FLEET, me, ("tcp/127.0.0.1:9999",), "")
+    return StreamAccess(InForce(FLEET), me, ("tcp/127.0.0.1:9999",), "")
 
 
 def test_the_own_relay_is_the_way_to_the_own_streams_and_the_local_side_is_another() -> None:
@@ -178,7 +179,9 @@ def test_the_own_relay_is_the_way_to_the_own_streams_and_the_local_side_is_anoth
 
 
 def test_the_local_side_of_a_secured_fleet_is_plain_text() -> None:
-    secured = StreamAccess(FLEET, "robot1", ("tls/127.0.0.1:9999",), '{transport: {link: {protocols: ["tls"]}}}')
+    secured = StreamAccess(
+        InForce(FLEET), "robot1", ("tls/127.0.0.1:9999",), '{transport: {link: {protocols: ["tls"]}}}'
+    )
     sides = {name: json.loads(text) for name, text in secured.answer("robot1")["sides"].items()}
     assert sides["fleet"]["transport"]["link"]["protocols"] == ["tls"]
     assert not sides["local"].get("transport", {}).get("link", {}).get("protocols"), "it dials tcp"

@@ -27,6 +27,7 @@ from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState
 from zsched.core.vote.tally import VoteOutcome, tally
@@ -203,7 +204,7 @@ class Loop:
         )
         fleet = fleet_of(self.spec, of=(*names, *self.robots), timing=self.timing)
         self.allocation = allocation_of(owner=names[0], tuning=self.spec.tuning)
-        self.gateways = {robot: Gateway(fleet) for robot in self.robots}
+        self.gateways = {robot: Gateway(InForce(fleet)) for robot in self.robots}
         self.judges = {robot: Judge(spec=self.spec) for robot in self.robots}
         self.profilers = {name: Profiler(name, 1, self.timing) for name in (*names, *self.robots)}
         self.states = dict.fromkeys(self.profilers, PeerState.ALIVE)

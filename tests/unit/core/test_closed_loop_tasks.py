@@ -25,6 +25,7 @@ from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.usage import book
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights
 from zsched.core.values.profile import DeviceSample, WorkerState
 
@@ -113,7 +114,7 @@ class Tasks:
             name: allocation_of(task=name, owner=f"edge{owner}", tuning=spec.tuning)
             for (name, spec), owner in zip(self.specs.items(), owners, strict=False)
         }
-        self.gateway = Gateway(fleet)
+        self.gateway = Gateway(InForce(fleet))
         self.judges = {name: Judge(spec=spec) for name, spec in self.specs.items()}
         self.profilers = {name: Profiler(name, 1, self.timing) for name in self.machines}
         self.states = dict.fromkeys((*self.machines, ROBOT), PeerState.ALIVE)

@@ -566,7 +566,7 @@ def test_a_node_that_others_do_not_let_in_is_told_that_its_certificate_may_be_ol
     node.handle(ev.AddressesTried(found=((node.solitude.dialled[0], TAKEN),)), 110.0)
     invite = "On a node of the fleet `zsched invite robot1`, then stop this daemon and `zsched join` here"
     assert not any(invite in one for one in build_snapshot(node, 110.0).problems), "nobody needs a certificate"
-    node.fleet = replace(node.fleet, security=Security(folder="/pki"))
+    node.in_force.take(replace(node.fleet, security=Security(folder="/pki")))
     assert invite in build_snapshot(node, 110.0).problems[0]
     node.set_problem(Problem.CERTIFICATE, "it has not begun: set the clock")
     told = build_snapshot(node, 110.0).problems
@@ -598,7 +598,7 @@ def test_a_node_that_dials_nobody_says_where_it_is_dialled(dialled_at: str, way:
 def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -> None:
     """The electors agree on an escape then, but no ordinary vote is won."""
     node = make(alive=())
-    node.fleet = replace(node.fleet, electors=("robot1",))
+    node.in_force.take(replace(node.fleet, electors=("robot1",)))
     (problem,) = build_snapshot(node, 100.0).problems
     assert problem == (
         "no planned moves: 1 of 3 robots can vote, 2 needed; not robot2 (not heard yet), robot3 (not heard "
@@ -659,7 +659,7 @@ def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start()
     node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
     told_by(node, "edge1", 1, WorkerState.STOPPED, "no token")
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "our own standby, which a move starts"
-    node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
+    node.in_force.take(replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks)))
     assert build_snapshot(node, 100.0).tasks[0].problems == ("the worker on edge1 is stopped: no token",)
 
 
@@ -839,7 +839,7 @@ def test_an_owner_s_worker_that_was_ready_is_not_said_to_be_starting() -> None:
 def test_a_slot_that_somebody_else_s_worker_does_not_take_is_told_with_what_mends_it() -> None:
     """It was started on a session that did not know this robot yet."""
     node = make()
-    node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
+    node.in_force.take(replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks)))
     learn(node, 1, "edge1")
     (waits,) = build_snapshot(node, 103.0).tasks[0].problems
     assert "must start it again" in waits
@@ -900,7 +900,7 @@ def test_an_owner_that_has_work_and_ends_no_job_is_a_problem(
     assert len(problems) == (told is not None)
     assert all(f"has had work for {told}" in one for one in problems)
     assert all(one.endswith("`zsched restart merge` starts it anew") for one in problems)
-    node.fleet = replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks))
+    node.in_force.take(replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks)))
     problems = [one for one in build_snapshot(node, 101.0).tasks[0].problems if "finished no job" in one]
     assert len(problems) == (told is not None)
     assert all(one.endswith("in a callback; start it again there") for one in problems), "it is somebody else's"
@@ -1024,7 +1024,7 @@ def test_a_worker_that_shows_itself_before_we_have_its_document_is_seen_once_we_
     node = make()
     node.handle(ev.WorkerShown(node="edge1", task="new", incarnation="1"), 100.0)
     node.handle(ev.WorkerShown(node="edge9", task="merge", incarnation="1"), 100.0)
-    node.probation.adopt(node.fleet)
+    node.in_force.take(node.fleet)
     assert node.probation.sees("edge1", "new")
     assert node.probation.sees("edge9", "merge")
     node.handle(ev.WorkerShown(node="edge1", task="new", incarnation="1", is_present=False), 101.0)

@@ -16,6 +16,7 @@ from zsched.core import instructions as do
 from zsched.core.relay_protocol import TaskEnded, WorkerWatch
 from zsched.core.values.certificates import Holder
 from zsched.core.values.fleet import Fleet, Security, StreamRule, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.plan import Direction, ReadyWhen
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.endpoints import endpoints_for
@@ -28,9 +29,10 @@ FLEET = fleet_of(of=("robot1", "robot2"), tasks=(), security=SECURITY)
 
 
 def adoption_of(fleet: Fleet, **parts: Any) -> Adoption:
-    others = ("recipes", "crew", "supervisor", "relay", "bus", "access", "desk", "post", "sampler", "compare_sessions")
+    others = ("recipes", "crew", "supervisor", "relay", "bus", "post", "sampler", "compare_sessions")
     return Adoption(
         me="robot1",
+        here=InForce(fleet),
         started_with=fleet,
         points=endpoints_for(fleet, fleet.node("robot1"), lambda: 7458, protocol="tls"),
         protocol="tls",
@@ -49,7 +51,7 @@ def adoption_of(fleet: Fleet, **parts: Any) -> Adoption:
 def test_orders_count_by_the_fleet_in_force_before_sessions_are_opened_anew(new: Fleet, then: list[str]) -> None:
     bus, compared = Mock(), Mock()
     adoption = adoption_of(FLEET, bus=bus, compare_sessions=compared)
-    adoption.adopt(new)
+    adoption.follow(new)
     (holders,) = bus.take_orders_of.call_args.args
     assert sorted(one.label for one in holders) == then
     assert Holder(name="robot1") in holders
@@ -69,7 +71,7 @@ def test_what_a_peer_may_send_follows_the_tasks_that_come() -> None:
         names=("robot1", "robot2"),
     )
     tasks = tuple(task_of(f"t{number}", ("robot1",)) for number in range(50))
-    adoption_of(FLEET, bus=bus).adopt(replace(FLEET, tasks=tasks))
+    adoption_of(FLEET, bus=bus).follow(replace(FLEET, tasks=tasks))
     assert bus._buckets is not None
     wanted = limit_for(FLEET.timing, 50)
     for buckets in bus._buckets.values():
@@ -84,7 +86,7 @@ def test_a_task_that_was_removed_and_added_again_is_watched_again(is_another_fil
     relay = RelayHandle(fleet="hall", node="robot1", zenoh_config="{}", on_report=Mock())
     adoption = adoption_of(fleet, relay=relay)
     shell = Shell(node="robot1", inbox=Inbox(), bus=Mock(), state_file=Mock(), desk=Mock())
-    shell.relay, shell.follow, shell.end = relay, adoption.adopt, adoption.end
+    shell.relay, shell.follow, shell.end = relay, adoption.follow, adoption.end
     adoption.begin()
     told = [frame for frame in relay._outbox.items.values() if isinstance(frame, WorkerWatch)]
     assert [one.task for one in told] == ["merge"]

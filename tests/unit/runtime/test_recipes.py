@@ -59,14 +59,14 @@ def recipes(tmp_path: Path) -> Iterator[Recipes]:
 
 
 def test_a_session_in_use_stays_whole_when_the_next_one_cannot_be_written(recipes: Recipes, disk: Disk) -> None:
-    recipes.adopt(fleet_of(MERGE), HERE, dials_by_gossip=False)
+    recipes.make(fleet_of(MERGE), HERE, dials_by_gossip=False)
     path, before = recipes.paths["merge"], recipes.session("merge")
     disk.is_full = True
     with pytest.raises(AdapterError, match=r"cannot write \S+edge1-merge.zenoh.json5: No space left on device"):
-        recipes.adopt(fleet_of(MERGE, PLAN), THERE, dials_by_gossip=False)
+        recipes.make(fleet_of(MERGE, PLAN), THERE, dials_by_gossip=False)
     assert (path.read_text(), recipes.session("merge"), set(recipes.specs)) == (before, before, {"merge"})
     disk.is_full = False
-    recipes.adopt(fleet_of(MERGE, PLAN), THERE, dials_by_gossip=False)
+    recipes.make(fleet_of(MERGE, PLAN), THERE, dials_by_gossip=False)
     for task in ("merge", "plan"):
         assert "192.0.2.1" in recipes.session(task)
         assert recipes.paths[task].read_text() == recipes.session(task)
@@ -76,7 +76,7 @@ def test_a_change_that_is_taken_back_after_half_of_its_sessions_were_written_tak
     recipes: Recipes, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet = fleet_of(MERGE, PLAN)
-    recipes.adopt(fleet, HERE, dials_by_gossip=False)
+    recipes.make(fleet, HERE, dials_by_gossip=False)
     before = recipes.session("merge")
 
     def full_after_one(path: Path, content: bytes) -> None:
@@ -85,17 +85,17 @@ def test_a_change_that_is_taken_back_after_half_of_its_sessions_were_written_tak
 
     monkeypatch.setattr(recipes_module, "write_regular", full_after_one)
     with pytest.raises(AdapterError):
-        recipes.adopt(fleet, THERE, dials_by_gossip=False)
+        recipes.make(fleet, THERE, dials_by_gossip=False)
     assert "192.0.2.1" in recipes.paths["merge"].read_text(), "the first one was written"
     monkeypatch.undo()
-    recipes.adopt(fleet, HERE, dials_by_gossip=False)
+    recipes.make(fleet, HERE, dials_by_gossip=False)
     assert recipes.paths["merge"].read_text() == before
 
 
 def test_a_program_that_knows_zenohs_own_variable_joins_the_data_network(
     recipes: Recipes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipes.adopt(fleet_of(MERGE), HERE, dials_by_gossip=False)
+    recipes.make(fleet_of(MERGE), HERE, dials_by_gossip=False)
     environment = recipes.environment("merge")
     assert environment["ZENOH_CONFIG"] == environment["ZENOH_SESSION_CONFIG_URI"] == str(recipes.paths["merge"])
     monkeypatch.setenv("ZENOH_CONFIG", environment["ZENOH_CONFIG"])
@@ -127,7 +127,7 @@ def test_a_worker_without_the_key_dials_its_own_relay_only(tmp_path: Path) -> No
         by_socket=(("unixsock-stream//run/r.sock",), "{}"),
     )
     task = task_of("merge", worker=WorkerSpec(command=("work",), user="ros"))
-    made.adopt(fleet_of(task, PLAN, security=Security(folder="pki")), THERE, dials_by_gossip=False)
+    made.make(fleet_of(task, PLAN, security=Security(folder="pki")), THERE, dials_by_gossip=False)
     assert "/k" in made.session("plan")
     assert "/k" not in made.session("merge")
     settings = zenoh.Config.from_json5(made.session("merge"))

@@ -259,7 +259,7 @@ class WorkerSupervisor:
         """Stop ``task``'s worker as `stop` does, and start it again, without its failures; that counts as none."""
         self._command(self._on_renew, task)
 
-    def adopt(self, specs: Mapping[TaskId, WorkerSpec]) -> None:
+    def keep(self, specs: Mapping[TaskId, WorkerSpec]) -> None:
         """Keep these workers from now on, with these settings.
 
         No process ends by it but one whose task has no ``command`` any more: a worker that is not among ``specs`` goes

@@ -6,6 +6,8 @@ Knows: the learnt fleet value, the document in force, which beats count. Does no
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.pilot import Course, Pilot, Word
@@ -13,9 +15,11 @@ from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, Timing
 from zsched.core.values.model import NodeId
 
+STAGGER_BALLOTS = 2
+"""Each elector proposes a change of the electors so many times ``ballot_s`` after the one before."""
 _NOBODY: tuple[NodeId, ...] = ()
 
 
@@ -25,21 +29,18 @@ class Helm:
     Args:
         numbers: this node's.
         me: this node.
-        stagger_s: how much later than the one before each elector proposes (seconds).
+        clocks: those in force; each elector proposes so many times a ballot's deadline later than the one before
+            (`STAGGER_BALLOTS`).
         now: monotonic seconds.
     """
 
-    def __init__(self, numbers: Numbers, me: NodeId, *, stagger_s: float, now: float) -> None:
-        self._numbers, self._me = numbers, me
-        self._pilot = Pilot(me=me, disk="", stagger_s=stagger_s, now=now)
+    def __init__(self, numbers: Numbers, me: NodeId, *, clocks: Callable[[], Timing], now: float) -> None:
+        self._numbers, self._me, self._clocks = numbers, me, clocks
+        self._pilot = Pilot(me=me, disk="", now=now)
         self._told: FleetValue | None = None
         """The value whose electors the decision log has."""
         self._read: tuple[str, Course | None] = "", None
         """(document, what it says)."""
-
-    def adopt(self, *, stagger_s: float) -> None:
-        """Go by another fleet file (argument as of the class)."""
-        self._pilot.stagger_s = stagger_s
 
     @property
     def reason(self) -> str:
@@ -83,7 +84,9 @@ class Helm:
         course = self._course(value)
         if course is None or not roll.is_elector:
             return
-        change = self._pilot.tick(value, course, now, is_busy=roll.is_busy)
+        change = self._pilot.tick(
+            value, course, now, stagger_s=STAGGER_BALLOTS * self._clocks().ballot_s, is_busy=roll.is_busy
+        )
         if change is not None:
             self._numbers.propose(change, todo, now)
 

@@ -24,7 +24,8 @@ from zsched.core.values.change import Rewrite
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import Creation, FleetValue
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.fleet import Fleet, Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
 from zsched.core.values.problems import Problem, ProblemKey
@@ -35,7 +36,7 @@ class Numbers:
     """One node's roll, from the moment on at which the node knows its generation.
 
     Args:
-        fleet: what this node goes by at its start: its fleet file, or the document that its state names.
+        here: what this node goes by: its fleet file, or the agreed document.
         me: this node.
         durable: its state, or ``None``.
         incarnation: of this daemon.
@@ -49,7 +50,7 @@ class Numbers:
     def __init__(
         self,
         *,
-        fleet: Fleet,
+        here: InForce,
         me: NodeId,
         durable: DurableState | None,
         incarnation: int,
@@ -59,7 +60,7 @@ class Numbers:
         stored: Mapping[str, Fleet],
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
-        self._fleet, self._me, self._incarnation = fleet, me, incarnation
+        self._here, self._me, self._incarnation = here, me, incarnation
         self._registers, self._recall, self._rng = registers, recall, rng
         self.disk = "" if durable is None else durable.disk
         self._stored = None if durable is None else durable.fleet_register
@@ -71,11 +72,12 @@ class Numbers:
         self._held_for: FleetValue | None = None
         """The newest value that a peer has told as learnt, while its document is missing."""
 
-    def adopt(self, fleet: Fleet) -> None:
-        """Go by another fleet file; its registers are there already, but for those of a document (`Roll`)."""
-        self._fleet = fleet
-        if self.roll is not None:
-            self.roll.adopt(ballot_s=fleet.timing.ballot_s, stagger_s=fleet.timing.stagger_s)
+    @property
+    def _fleet(self) -> Fleet:
+        return self._here.fleet
+
+    def _clocks(self) -> Timing:
+        return self._here.timing
 
     def begin(self, generation: int, electorate: str, todo: ToDo, now: float, *, may_elect: bool) -> None:
         """The generation is known: count by what the state holds, or by what every node makes of its file."""
@@ -91,8 +93,7 @@ class Numbers:
             begin=self._created,
             holds=self._may_follow,
             electorate=electorate,
-            ballot_s=self._fleet.timing.ballot_s,
-            stagger_s=self._fleet.timing.stagger_s,
+            clocks=self._clocks,
             rng=self._rng,
             now=now,
             may_elect=may_elect,
@@ -123,8 +124,7 @@ class Numbers:
             is_elector=False,
             initial=task.first_value(creation.start),
             state=self._recall(creation) or RegisterState(task=creation.task, creation=creation.number),
-            ballot_s=self._fleet.timing.ballot_s,
-            stagger_s=self._fleet.timing.stagger_s,
+            clocks=self._clocks,
             rng=self._rng,
             disk=self.disk,
         )
@@ -362,7 +362,7 @@ class Numbers:
     def _adopt(self, todo: ToDo) -> None:
         fleet = self.in_force
         if fleet is not None:
-            self._fleet = todo.in_force = fleet
+            todo.in_force = fleet
 
     def _keep(self, roll: Roll, todo: ToDo) -> None:
         """The state's documents, the one before, and those of our own changes: others may go."""
@@ -426,7 +426,7 @@ class Numbers:
         """Ask for, or tell, what was learnt: fleet values travel with the tasks' values."""
         for order in todo.fleet:
             if isinstance(order, do.AskFleet):
-                ask = do.AskLearnt(peer=order.peer, deadline_s=self._fleet.timing.ballot_s)
+                ask = do.AskLearnt(peer=order.peer, deadline_s=self._here.timing.ballot_s)
                 if ask not in todo.send:  # a frame may hold many questions under a number that is not known here
                     todo.add(ask)
             elif isinstance(order, do.TellFleet):

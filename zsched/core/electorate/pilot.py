@@ -115,13 +115,11 @@ class Pilot:
     Args:
         me: this node.
         disk: id of its disk, if it may elect.
-        stagger_s: how much later than the one before each elector proposes (seconds).
         now: monotonic seconds.
     """
 
     me: NodeId
     disk: str
-    stagger_s: float
     now: float
     advice: Advice = Advice(change=None, reason="")
     """The newest, for the status."""
@@ -186,23 +184,26 @@ class Pilot:
 
     # --- what is to be done ------------------------------------------------------------------------------------------
 
-    def tick(self, value: FleetValue, course: Course, now: float, *, is_busy: bool) -> FleetChange | None:
+    def tick(
+        self, value: FleetValue, course: Course, now: float, *, stagger_s: float, is_busy: bool
+    ) -> FleetChange | None:
         """The change to propose now, if it is this node's turn; `advice` says why, or why there is none.
 
         Args:
             value: learnt.
             course: the document's.
             now: monotonic seconds.
+            stagger_s: how much later than the one before each elector proposes (seconds).
             is_busy: a change of this node's is under way.
         """
         self.advice = self.advise(value, course, now)
         wish, before = self.advice.change, self._wish
         self._wish = wish
         if wish is None or is_busy or not _is_same(wish, before):
-            self._due = now + self.stagger_s * self._rank(value, course, now)
+            self._due = now + stagger_s * self._rank(value, course, now)
         if wish is None or is_busy or now < self._due:
             return None
-        self._due = now + self.stagger_s * (1 + len(value.electors))  # it may have been lost: once more
+        self._due = now + stagger_s * (1 + len(value.electors))  # it may have been lost: once more
         return wish
 
     def advise(self, value: FleetValue, course: Course, now: float) -> Advice:

@@ -26,6 +26,7 @@ from zsched.core.register.fleet_register import FleetRegister
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Creation, Elector, FleetValue
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, Ballot, NodeId, RegisterState, TaskId
 
@@ -48,8 +49,7 @@ class Roll:
         state: of the fleet register, as stored or founded; its learnt value is the one to follow.
         registers: the tasks' registers; the roll adds, removes and renumbers them.
         begin: makes the blank register of a task that was created; ``None``: nothing is known of the task yet.
-        ballot_s: deadline of one phase.
-        stagger_s: base of the back-off.
+        clocks: those in force: of them a phase's deadline and the base of the back-off.
         rng: for back-off.
         now: monotonic seconds.
         holds: whether the document of a fleet value is stored here; without it no value is accepted or learnt.
@@ -66,8 +66,7 @@ class Roll:
         state: RegisterState[FleetValue],
         registers: dict[TaskId, TaskRegister],
         begin: Callable[[Creation], TaskRegister | None],
-        ballot_s: float,
-        stagger_s: float,
+        clocks: Callable[[], Timing],
         rng: Random,
         now: float,
         holds: Callable[[FleetValue], bool] = lambda _value: True,
@@ -78,7 +77,7 @@ class Roll:
             raise ValueError("a roll follows a fleet value: none is learnt")
         self._me, self._disk = me, disk
         self._registers, self._begin = registers, begin
-        self._stagger_s, self._rng = stagger_s, rng
+        self._clocks, self._rng = clocks, rng
         self._may_elect = may_elect
         self.value = state.learnt
         self._seated = self.value, self._seat_in(self.value)
@@ -90,23 +89,16 @@ class Roll:
             is_elector=self.is_elector,
             initial=self.value,
             state=state,
-            ballot_s=ballot_s,
-            stagger_s=stagger_s,
+            clocks=clocks,
             rng=rng,
             disk=disk,
         )
         self._holds = self._register.holds = holds
-        self._settling = Settling(2 * ballot_s)
+        self._settling = Settling(clocks)
         self._list(ToDo(), now)
         self._count(is_blank=False, is_new=False, now=now)
         if not self.value.settled:
             self._settling.begin(self.value, now + self._jitter(), self._rank())
-
-    def adopt(self, *, ballot_s: float, stagger_s: float) -> None:
-        """Another fleet file is gone by: its clocks hold from the next round on."""
-        self._stagger_s = stagger_s
-        self._register.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)
-        self._settling.pause_s = 2 * ballot_s
 
     # --- queries -----------------------------------------------------------------------------------------------------
 
@@ -167,7 +159,7 @@ class Roll:
         return names.index(self._me) if self._me in names else len(names)
 
     def _jitter(self) -> float:
-        return self._stagger_s * (0.5 + self._rng.random())
+        return self._clocks().stagger_s * (0.5 + self._rng.random())
 
     # --- elector -----------------------------------------------------------------------------------------------------
 

@@ -15,26 +15,31 @@ know: how a round goes (`zsched.core.register.register`), whether somebody else 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from zsched.core.electorate.changes import Settle
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Electorate, FleetValue
+from zsched.core.values.fleet import Timing
 from zsched.core.values.lease import hold_s
 
 
 class Settling:
     """One elector's work for one number."""
 
-    def __init__(self, pause_s: float) -> None:
-        self.pause_s = pause_s
-        """What is missing is tried again after this time."""
+    def __init__(self, clocks: Callable[[], Timing]) -> None:
+        self._clocks = clocks
         self._of: Electorate | None = None
         self._whole_at: float | None = None
         """When the last identity round of this number ended."""
         self._ask_at = self._say_at = math.inf
         """When identity rounds that are missing, and the word that all is settled, are tried (again)."""
+
+    @property
+    def _pause_s(self) -> float:
+        """What is missing is tried again after this time."""
+        return 2 * self._clocks().ballot_s
 
     def begin(self, value: FleetValue, at: float, rank: int) -> None:
         """A fleet value is learnt: work for its number, from ``at`` on, unless it is settled.
@@ -45,7 +50,7 @@ class Settling:
         if value.settled:
             self._of, self._whole_at = None, None
         elif self._of != value.electorate:
-            at += rank * self.pause_s + (_guard_s(value) if rank else 0.0)
+            at += rank * self._pause_s + (_guard_s(value) if rank else 0.0)
             self._of, self._whole_at, self._ask_at, self._say_at = value.electorate, None, at, at
 
     def due(self, value: FleetValue, registers: Iterable[TaskRegister]) -> float:
@@ -62,7 +67,7 @@ class Settling:
         for register in missing:
             register.settle(todo, now)
         if missing:
-            self._ask_at = now + self.pause_s
+            self._ask_at = now + self._pause_s
             return None
         if self._whole_at is None:
             self._whole_at = now
@@ -71,7 +76,7 @@ class Settling:
             self._say_at = now + (hold_s(value.guard_lease_s) if is_leased else _guard_s(value))
         if now < self._say_at:
             return None
-        self._say_at = now + self.pause_s
+        self._say_at = now + self._pause_s
         has_waited = now >= self._whole_at + hold_s(value.guard_lease_s)
         return Settle(base_revision=value.revision, number=value.number, has_waited=has_waited)
 

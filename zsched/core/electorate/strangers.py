@@ -13,6 +13,7 @@ from functools import lru_cache
 from zsched.core.electorate.founding import founded_id
 from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import SAID_DIGITS, TOLD_DIGITS, FleetValue, generation_in
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
@@ -31,13 +32,11 @@ class Strangers(Struct):
     """The strangers that one node hears.
 
     Args:
-        fleet: the fleet's name.
-        silence_s: after this time without a beat of this node's generation a stranger's other frames do not count
-            (seconds). A single forged beat thus ends nothing.
+        in_force: the fleet. After its ``suspect_s`` without a beat of this node's generation a stranger's other frames
+            do not count. A single forged beat thus ends nothing.
     """
 
-    fleet: str
-    silence_s: float
+    in_force: InForce
     _heard: dict[NodeId, tuple[str, float]] = field(default_factory=dict)
     """{node: (its generation as told, when)}."""
     _ours_at: dict[NodeId, float] = field(default_factory=dict)
@@ -72,11 +71,12 @@ class Strangers(Struct):
         named = generation_in(beat.lease_terms)
         if not ours or not (named or is_named):
             return None
-        return named or _told_of_file(self.fleet, beat.generation)
+        return named or _told_of_file(self.in_force.fleet.name, beat.generation)
 
     def is_one(self, node: NodeId, now: float) -> bool:
         """Whether a node's other frames are a stranger's."""
-        return node in self._heard and now - self._ours_at.get(node, -self.silence_s) >= self.silence_s
+        silence_s = self.in_force.timing.suspect_s
+        return node in self._heard and now - self._ours_at.get(node, -silence_s) >= silence_s
 
     def must_ask(self, node: NodeId, now: float) -> bool:
         """Whether to ask a stranger by whom it was recovered; a yes counts as asked."""
@@ -91,7 +91,7 @@ class Strangers(Struct):
         value = learnt.fleet
         if ours is None or not (value is not None or is_named):
             return False
-        told = founded_id(self.fleet, learnt.generation) if value is None else value.generation_id
+        told = founded_id(self.in_force.fleet.name, learnt.generation) if value is None else value.generation_id
         if told == ours.generation_id:
             return False
         if len(self._by) < KEPT:

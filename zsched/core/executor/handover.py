@@ -172,7 +172,7 @@ class Executor:
 
     # --- a changed fleet file ------------------------------------------------------------------------------------
 
-    def adopt(self, spec: TaskSpec, todo: ToDo, now: float, *, is_agreed_leased: bool) -> None:
+    def on_spec(self, spec: TaskSpec, todo: ToDo, now: float, *, is_agreed_leased: bool) -> None:
         """Go by another version of the task's file: worker, right to work and streams follow it at once.
 
         The slots of predecessors stay as they were opened. ``is_agreed_leased``: the task is exclusive for everybody.

@@ -27,7 +27,8 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.instructions import RecordStory, RestartWorker
 from zsched.core.scheduler.probation import LIMIT_S
 from zsched.core.todo import ToDo
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import Profile, TaskProgress, WorkerState
@@ -93,32 +94,19 @@ class HangJudge:
 class HangWatch:
     """Both views of one node: as an owner of the tasks that say `output_deadline_s`, as a robot of all."""
 
-    def __init__(self, fleet: Fleet) -> None:
-        self.progress = Progress()
+    def __init__(self, in_force: InForce) -> None:
+        self._in_force = in_force
+        self.progress = Progress(in_force)
         self._judge = HangJudge()
-        self._back_at: dict[NodeId, float] = {}
+        self._back_at: dict[NodeId, float] = in_force.by_node()
         """{robot: when it was heard again after a silence}."""
-        self._specs: dict[TaskId, TaskSpec] = {}
-        self.adopt(fleet, {}, 0.0)
 
-    def adopt(self, fleet: Fleet, workers: Mapping[TaskId, WorkerState], now: float) -> None:
-        """Take the tasks with a deadline and the robots from ``fleet``.
+    @property
+    def _voters(self) -> tuple[NodeId, ...]:
+        return self._in_force.fleet.voters
 
-        Args:
-            fleet: the fleet file.
-            workers: {task: state} of the workers here; a ready one that was not watched gets its whole time from now.
-            now: monotonic seconds.
-        """
-        known = self._specs
-        self._tasks = fleet.tasks
-        self._specs = {spec.name: spec for spec in fleet.tasks if spec.worker.output_deadline_s is not None}
-        self._voters = fleet.voters
-        self.progress.adopt(fleet.tasks)
-        for task in [task for task in known if task not in self._specs]:
-            self._judge.note_worker(task, WorkerState.STOPPED, now)
-        for task in [task for task in self._specs if task not in known and task in workers]:
-            self._judge.note_worker(task, workers[task], now)
-        self._back_at = {robot: at for robot, at in self._back_at.items() if robot in self._voters}
+    def _has_deadline(self, task: TaskId) -> bool:
+        return self._in_force.tasks[task].worker.output_deadline_s is not None
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Our relay has counted."""
@@ -126,29 +114,28 @@ class HangWatch:
 
     def note_worker(self, task: TaskId, state: WorkerState, now: float) -> None:
         """A worker of this node has changed."""
-        if task in self._specs:
-            self._judge.note_worker(task, state, now)
+        self._judge.note_worker(task, state, now)
 
     def on_ready_again(self, task: TaskId) -> None:
         """Our relay lacked the owner's worker, and has it again: maybe another one, which is not to be ended for it."""
-        if task in self._specs:
+        if self._has_deadline(task):
             self.progress.begin_again(task)
 
     def excuse(self, task: TaskId) -> None:
         """The owner's worker is away or another one, or the way to it was: by its rhythm it owes nothing so far."""
-        if task not in self._specs:
+        if not self._has_deadline(task):
             self.progress.begin_again(task)
 
     def note_lag(self, lag_s: float, now: float) -> None:
         """This node stood still for this many seconds; a pause of half a deadline or more starts all waits again."""
-        for spec in self._tasks:
+        for spec in self._in_force.fleet.tasks:
             if lag_s >= max(spec.worker.output_deadline_s or 0.0, COUNT_S) / 2:
                 self.progress.begin_again(spec.name, now)
                 self._judge.begin_again(spec.name, now)
 
     def on_back(self, node: NodeId, now: float) -> None:
         """A peer that was suspect or gone is heard again."""
-        if self._specs and node in self._voters:
+        if node in self._voters:
             self._back_at[node] = now
 
     def _unproven(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
@@ -168,7 +155,7 @@ class HangWatch:
         now: float,
     ) -> None:
         """A robot's profile came: restart our workers that hang; of a foreign worker only report it."""
-        for spec in [self._specs[task] for task in owned if task in self._specs]:
+        for spec in [self._in_force.tasks[task] for task in owned if self._has_deadline(task)]:
             profiles = [profile for robot in self._voters if (profile := gateway.fresh(robot, now)) is not None]
             reason = self._judge.hangs(spec, executors[spec.name], profiles, now, self._unproven(spec, now))
             if not reason:

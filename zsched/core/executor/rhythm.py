@@ -13,12 +13,13 @@ the owner (`zsched.core.executor.progress`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 from zsched.core.absence import FORGIVEN_RATIO
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import TaskId
 from zsched.core.values.plan import Direction, StreamCount
 from zsched.core.values.profile import TaskProgress
@@ -104,19 +105,14 @@ class Rhythm(Struct):
 class Progress:
     """One robot's view of all tasks: does the owner answer?"""
 
-    def __init__(self, specs: Iterable[TaskSpec] = ()) -> None:
-        self._known: dict[TaskId, tuple[int, dict[str, Rhythm]]] = {}
+    def __init__(self, in_force: InForce) -> None:
+        self._in_force = in_force
+        self._known: dict[TaskId, tuple[int, dict[str, Rhythm]]] = in_force.by_task()
         """{task: (epoch, {stream, or empty: its rhythm})}."""
-        self.adopt(specs)
-
-    def adopt(self, specs: Iterable[TaskSpec]) -> None:
-        """Watch these tasks from now on."""
-        self._specs = {spec.name: spec for spec in specs}
-        self._known = {task: known for task, known in self._known.items() if task in self._specs}
 
     def absorb(self, counts: tuple[StreamCount, ...], executors: Mapping[TaskId, Executor], now: float) -> None:
         """Take the relay's counters in; during a handover nobody owes anything."""
-        for task, spec in self._specs.items():
+        for task, spec in self._in_force.tasks.items():
             executor = executors[task]
             epoch, known = self._known.get(task, (executor.epoch, dict[str, Rhythm]()))
             is_steady = executor.has_streams and executor.phase is Phase.SETTLED and not executor.is_local
@@ -137,7 +133,7 @@ class Progress:
 
         Not of a task that says how soon it answers.
         """
-        spec, (counted, known) = self._specs.get(task), self._known.get(task, (epoch, {}))
+        spec, (counted, known) = self._in_force.tasks.get(task), self._known.get(task, (epoch, {}))
         if spec is None or counted != epoch or spec.worker.output_deadline_s is not None:
             return None
         return max((waited_s for one in known.values() if (waited_s := one.overdue_s(now)) is not None), default=None)
@@ -146,7 +142,7 @@ class Progress:
         """This robot's reports of the tasks that say how soon they answer: served, or waiting while inputs flow."""
         found = []
         for task, (epoch, known) in sorted(self._known.items()):
-            deadline_s, rhythm = self._specs[task].worker.output_deadline_s, known.get("")
+            deadline_s, rhythm = self._in_force.tasks[task].worker.output_deadline_s, known.get("")
             if deadline_s is None or rhythm is None:
                 continue
             is_answered = rhythm.waits_since is None and rhythm.given_at is not None

@@ -24,7 +24,8 @@ from collections.abc import Callable, Mapping
 from zsched.core.executor.handover import Executor
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import SetLeased
-from zsched.core.values.fleet import Fleet, TaskSpec, fleet_hash
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.struct import Struct, field
@@ -37,7 +38,7 @@ ASK_EVERY_S = 0.2
 class Sealing(Struct):
     """Decides for one node which changes of *leased* to propose and which peers to ask first."""
 
-    fleet: Fleet
+    in_force: InForce
     me: NodeId
     executors: Mapping[TaskId, Executor]
     over_at: float
@@ -46,30 +47,25 @@ class Sealing(Struct):
     """The terms of this node's leases now: by its file, or by the agreed number (`Leases.terms`)."""
     _files: dict[NodeId, str] = field(default_factory=dict)
     """{peer that was heard: its fleet file}."""
-    _gone: set[NodeId] = field(default_factory=set)
+    _gone: dict[NodeId, None] = field(default_factory=dict)
     """Those of them that are gone."""
     _owners: dict[TaskId, set[NodeId]] = field(default_factory=dict)
     """{task: who has owned it, as far as this node has learnt}."""
     _answers: dict[NodeId, Learnt] = field(default_factory=dict)
     _asked_at: float = -math.inf
 
-    def adopt(self, fleet: Fleet) -> None:
-        """Go by ``fleet``; nodes that it does not name are asked no more."""
-        self.fleet = fleet
-        names, tasks = {node.name for node in fleet.nodes}, {task.name for task in fleet.tasks}
-        self._files = {name: file for name, file in self._files.items() if name in names}
-        self._answers = {name: answer for name, answer in self._answers.items() if name in names}
-        self._gone &= names
-        self._owners = {task: owners & names for task, owners in self._owners.items() if task in tasks}
+    def __post_init__(self) -> None:
+        self._files, self._answers, self._gone = (self.in_force.by_node() for _ in range(3))
+        self._owners = self.in_force.by_task()
 
     def hear(self, beat: Beat) -> None:
         """Note the fleet file that a living peer's beat names."""
         self._files[beat.node] = beat.fleet_file
-        self._gone.discard(beat.node)
+        self._gone.pop(beat.node, None)
 
     def on_gone(self, node: NodeId) -> None:
         """A peer is gone."""
-        self._gone.add(node)
+        self._gone[node] = None
 
     def note(self, value: Allocation) -> None:
         """A newer value was learnt."""
@@ -112,20 +108,19 @@ class Sealing(Struct):
         """The tasks owned here whose agreed value differs from this node's file."""
         return [
             spec
-            for spec in self.fleet.tasks
+            for spec in self.in_force.fleet.tasks
             if (value := values[spec.name]).owner == self.me and value.leased is not spec.exclusive
         ]
 
     def _are_files_mixed(self) -> bool:
-        mine = fleet_hash(self.fleet)
-        return any(file != mine for name, file in self._files.items() if name not in self._gone)
+        return any(file != self.in_force.file for name, file in self._files.items() if name not in self._gone)
 
     def _waits_for(self, spec: TaskSpec, value: Allocation, now: float) -> dict[NodeId, str]:
         """{node that must be heard, or whose worker must stop, before the task is leased: reason}.
 
         Ours, too: electors do not wait for a worker that has never had a lease.
         """
-        owners = self._owners.get(spec.name, set())
+        owners = self._owners.get(spec.name, set()) & self.in_force.nodes.keys()
         heard = {name for name in self._files if name not in self._gone or name in owners}
         others = sorted({*heard, *spec.candidates} - {self.me})
         reasons = {name: self._obstacle(spec, value, name) for name in others}

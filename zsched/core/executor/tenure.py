@@ -15,7 +15,8 @@ from zsched.core.executor.handover import Executor
 from zsched.core.membership.peers import Membership
 from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
-from zsched.core.values.fleet import Fleet, OnIsolation
+from zsched.core.values.fleet import OnIsolation
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId
 from zsched.core.values.quorum import majority
 from zsched.core.vote.clocks import ClockDoubt
@@ -29,31 +30,22 @@ ALONE_AFTER_S = 0.5
 class Tenure:
     """One node's right to work, for all tasks."""
 
-    fleet: Fleet
+    in_force: InForce
     me: NodeId
     leases: Leases
     executors: Mapping[TaskId, Executor]
-    exclusive: tuple[TaskId, ...] = ()
-    """The tasks whose workers need a lease: by this node's file, or for everybody."""
     clock: ClockDoubt = field(default_factory=ClockDoubt)
-    voters: tuple[NodeId, ...] = field(init=False)
-    """The robots that count: without a majority of them this node is cut off; of the electors, if it alone does."""
-    _absences: dict[TaskId, tuple[int, Absences]] = field(default_factory=dict)
+    _absences: dict[TaskId, tuple[int, Absences]] = field(init=False)
     """{exclusive task that this node owns: (the epoch, of its valid lease in it)}."""
-    _alone_since: dict[TaskId, float] = field(default_factory=dict)
-    _local: tuple[TaskId, ...] = field(init=False)
+    _alone_since: dict[TaskId, float] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.adopt(self.fleet)
+        self._absences, self._alone_since = self.in_force.by_task(), self.in_force.by_task()
 
-    def adopt(self, fleet: Fleet) -> None:
-        """Go by ``fleet``, whose tasks the executors are for already."""
-        self.fleet = fleet
-        self._note_leased()
-        self._absences = {task: one for task, one in self._absences.items() if task in self.executors}
-        self.voters = self.fleet.voters
-        self._local = tuple(task.name for task in self.fleet.tasks if task.on_isolation is OnIsolation.LOCAL)
-        self._alone_since = {task: at for task, at in self._alone_since.items() if task in self._local}
+    @property
+    def exclusive(self) -> tuple[TaskId, ...]:
+        """The tasks whose workers need a lease: by this node's file, or for everybody."""
+        return tuple(name for name, executor in self.executors.items() if executor.is_leased)
 
     @property
     def is_busy(self) -> bool:
@@ -68,9 +60,6 @@ class Tenure:
                 due = min(due, at + ALONE_AFTER_S)
         return due
 
-    def _note_leased(self) -> None:
-        self.exclusive = tuple(name for name, executor in self.executors.items() if executor.is_leased)
-
     # --- exclusive tasks ---------------------------------------------------------------------------------------------
 
     def hold(self, value: Allocation, next_number: int) -> None:
@@ -79,7 +68,6 @@ class Tenure:
         One without an owner begins a generation. None of the electors of before has waited for our worker, which works
         until its lease ends: they must not hear that it has stopped.
         """
-        self._note_leased()
         if value.owner is None:
             return
         if value.task in self.exclusive and value.owner == self.me:
@@ -154,20 +142,25 @@ class Tenure:
         self._absences[value.task] = value.epoch, absences
         has_to_rest = not value.leased or value.task in self.leases.leaving()
         is_away = not has_to_rest and self.leases.until(value.task) <= now
-        limit_s = self.fleet.timing.suspect_s + self.fleet.timing.lease_s
+        limit_s = self.in_force.timing.suspect_s + self.in_force.timing.lease_s
         return absences.look(is_away, now, limit_s) >= limit_s
 
     # --- isolation ---------------------------------------------------------------------------------------------------
 
     def tend_isolation(self, membership: Membership, todo: ToDo, now: float) -> None:
         """Work alone exactly while cut off from the owner and from a quorum."""
-        if not self._local:
+        local = [task.name for task in self.in_force.tasks.values() if task.on_isolation is OnIsolation.LOCAL]
+        for name in [name for name in self._alone_since if name not in local]:
+            del self._alone_since[name]
+        if not local:
             return
         # The only robot that counts is always its own majority; whether anything can still be agreed electors tell.
-        counted = self.leases.electors if self.voters == (self.me,) else self.voters
+        # Without a majority of the robots that count this node is cut off.
+        voters = self.in_force.voters
+        counted = self.leases.electors if voters == (self.me,) else voters
         heard = sum(membership.state(name) is PeerState.ALIVE for name in counted)
         is_cut_off = heard < majority(len(counted))
-        for name in self._local:
+        for name in local:
             executor = self.executors[name]
             if executor.owner is None:
                 continue

@@ -48,11 +48,11 @@ class Workers(Struct):
     _unwatched: set[TaskId] = field(default_factory=set)
     """Those of them whose worker somebody else runs: it goes on, and nobody reports its end."""
 
-    def adopt(self, fleet: Fleet, me: NodeId, busy: AbstractSet[TaskId]) -> None:
-        """Take the tasks with a worker here from ``fleet``.
+    def on_fleet(self, fleet: Fleet, me: NodeId, busy: AbstractSet[TaskId]) -> None:
+        """Another fleet is in force: keep the workers of its tasks here.
 
         Args:
-            fleet: the fleet file.
+            fleet: it.
             me: this node.
             busy: the tasks whose worker here has not ended its work: it is told of until it has stopped, one that
                 somebody else runs until it has ended its work (`let_go`).

@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from zsched.core.gateway.demand import Demands, Need, speed_of
 from zsched.core.gateway.sharing import Shares
 from zsched.core.sequence import Order, Track
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile
 from zsched.core.values.struct import Struct
@@ -30,10 +31,11 @@ class EdgeData(Struct, frozen=True, kw_only=True):
 class Gateway:
     """This node's knowledge of every node, itself included."""
 
-    def __init__(self, fleet: Fleet) -> None:
-        self._profiles: dict[NodeId, tuple[Profile, float]] = {}
-        self._tracks: dict[NodeId, Track] = {}
-        self._readings: dict[NodeId, dict[GaugeName, float]] = {}
+    def __init__(self, in_force: InForce) -> None:
+        self._in_force = in_force
+        self._profiles: dict[NodeId, tuple[Profile, float]] = in_force.by_node()
+        self._tracks: dict[NodeId, Track] = in_force.by_node()
+        self._readings: dict[NodeId, dict[GaugeName, float]] = in_force.by_node()
         """{node: the last readings in this life of its gauges without which it may have a task}."""
         self.demands = Demands()
         """What tasks need, as this node has learnt it."""
@@ -41,25 +43,17 @@ class Gateway:
         """What they would get of full machines."""
         self.version = 0
         """Rises with every change; a result from an older version may be wrong."""
-        self.adopt(fleet)
 
-    def adopt(self, fleet: Fleet) -> None:
-        """Take nodes, candidates and the profiles' time to live from ``fleet``; profiles of other nodes go."""
-        self._names = frozenset(node.name for node in fleet.nodes)
-        self._ttl_s = fleet.timing.profile_ttl_s
-        self._tasks = {task.name: task for task in fleet.tasks}
-        for known in (self._profiles, self._tracks, self._readings):
-            for name in [name for name in known if name not in self._names]:
-                del known[name]
-        self.shares.keep(self._names)
-        self.version += 1
+    @property
+    def _ttl_s(self) -> float:
+        return self._in_force.timing.profile_ttl_s
 
     def absorb(self, profile: Profile, now: float, life: int | None = None) -> str | None:
         """Take a profile in; returns why it was refused (one word for a counter), or ``None``.
 
         ``life`` is the incarnation that the node's beats show: profiles of that life count at once.
         """
-        if profile.node not in self._names:
+        if profile.node not in self._in_force.nodes:
             return "foreign"
         track = self._tracks.setdefault(profile.node, Track())
         is_over = now - track.at > self._ttl_s or (profile.incarnation == life != track.incarnation)
@@ -104,7 +98,7 @@ class Gateway:
         profile = self.fresh(owner, now)
         if profile is None:
             return
-        spec = self._tasks.get(task)
+        spec = self._in_force.tasks.get(task)
         candidates = () if spec is None else spec.candidates
         heard_now = (self.fresh(name, now) for name in candidates)  # a machine that is gone would do none of it
         fastest = max((speed_of(one) for one in heard_now if one is not None), default=None)

@@ -162,13 +162,13 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     if node.membership.is_newest(beat.node):
         node.agreement.hear_pilot(beat, now)
     if beat.has_lost_state:
-        node.stateless.add(beat.node)
+        node.stateless[beat.node] = None
     elif node.stateless:
-        node.stateless.discard(beat.node)
+        node.stateless.pop(beat.node, None)
     if beat.lacks_state_file:
-        node.fileless.add(beat.node)
+        node.fileless[beat.node] = None
     elif node.fileless:
-        node.fileless.discard(beat.node)
+        node.fileless.pop(beat.node, None)
     if node.membership.state(beat.node) is not PeerState.GONE:  # or the beat is a late one
         node.sealing.hear(beat)
         node.retuning.hear(beat.node, beat.fleet_revision, node.agreement.fleet_revision)

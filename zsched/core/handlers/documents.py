@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.handlers.fleet import adopt, compare_file, follow
+from zsched.core.handlers.fleet import compare_file, follow, go_by
 from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet
@@ -21,9 +21,9 @@ from zsched.core.values.messages import FleetTold
 def take_effect(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """Another fleet is in force: its document is stored, the value with it is learnt, the registers count by it."""
     follow(node, fleet, todo, is_agreed=True)
-    adopt(node, fleet, todo, now)
+    go_by(node, fleet, todo, now)
     compare_file(node)
-    count_voters(node)
+    count_voters(node, todo)
     take_flags(node, todo, now)
 
 
@@ -34,12 +34,10 @@ def take_flags(node: Stages, todo: ToDo, now: float) -> None:
         todo.must_decide = True
 
 
-def count_voters(node: Stages) -> None:
-    """Votes and rounds go by the robots that are not away, and by the electors that are agreed."""
-    voters = node.agreement.voters
-    node.votes.count_with(voters)
-    node.rounds.count_with(voters, node.agreement.electors)
-    node.tenure.voters = voters
+def count_voters(node: Stages, todo: ToDo) -> None:
+    """Go by the robots that are not away, and by the electors that are agreed."""
+    node.in_force.count(node.agreement.voters, node.agreement.electors)
+    todo.must_decide = True
 
 
 def _on_asked(node: Stages, event: ev.FleetAsked, todo: ToDo, now: float) -> None:

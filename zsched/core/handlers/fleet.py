@@ -1,34 +1,32 @@
-"""A changed fleet file at the door: every part that is made from the file takes its share of another one over.
+"""A changed fleet file at the door: another fleet is in force, tasks come, change and go.
 
-Each part that holds something of the file has an `adopt`, which says what it takes and what it keeps. A node that has
-taken file B over acts from then on as one that was started with B, with what it knows of nodes and tasks that are in
-both. The order below is the parts' order in `zsched.core.stages`.
+All parts read the fleet in force (`zsched.core.values.in_force`) at each step. A node that has taken file B over acts
+from then on as one that was started with B, with what it knows of nodes and tasks that are in both. Only what begins or
+ends with a task is done here: registers, leases, rounds, workers, streams.
 
-Knows: which parts there are, which of them asks another one. Does not know: what a part takes, who read the file, how
-processes and sessions follow (`zsched.runtime.adoption`).
+Knows: which parts have something to begin or end. Does not know: who read the file, how processes and sessions follow
+(`zsched.runtime.adoption`).
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
 from typing import Any, Final
 
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.handlers.work import take_known
-from zsched.core.stages import HISTORY, Handler, Stages
+from zsched.core.stages import Handler, Stages
 from zsched.core.todo import ToDo
 from zsched.core.values.adoption import in_force, obstacle
 from zsched.core.values.fleet import Fleet, TaskSpec, file_hash, fleet_hash
-from zsched.core.values.model import Allocation, NodeKind, TaskId
+from zsched.core.values.model import Allocation, NodeKind
 from zsched.core.values.problems import Problem
 from zsched.core.values.words import CREATION_STEP
 
 
-def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
+def go_by(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """Go by another validated fleet from now on; the same one again changes nothing.
 
     One that this daemon cannot take over at all becomes a problem in the status, and the one before stays in force.
@@ -47,11 +45,15 @@ def adopt(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
         return
     if fleet == before and not anew:
         return
-    node.fleet, node.fleet_file, node.text_hash = fleet, fleet_hash(fleet), file_hash(fleet)
-    _adopt_nodes(node, fleet)
-    _adopt_choice(node, fleet, anew, todo, now)
-    _adopt_work(node, fleet, todo, now)
-    node.retuning.adopt(before, fleet, node.values(), now)
+    node.in_force.take(fleet, anew)
+    node.clear_problems(Problem.FLEET, Problem.OWN_FILE)
+    node.profiler.retune(fleet.timing)
+    node.gateway.version += 1
+    node.rounds.on_fleet(now, anew)
+    node.agreement.on_fleet(todo, now)
+    node.unconfirmed = {name: why for name, why in node.unconfirmed.items() if name in node.registers}
+    _change_work(node, fleet, todo, now)
+    node.retuning.want(before, node.values(), now)
     text = f"goes by another fleet file: {node.fleet_file}"
     todo.add(do.RecordStory(stage="membership", text=text))
     for task, change in node.rollouts.take(fleet, now):
@@ -73,38 +75,7 @@ def follow(node: Stages, fleet: Fleet, todo: ToDo, *, is_agreed: bool = False) -
         todo.add(do.AdoptFleet(fleet=fleet, is_agreed=is_agreed))
 
 
-def _adopt_nodes(node: Stages, fleet: Fleet) -> None:
-    """Membership, and what is remembered node by node."""
-    names, tasks = frozenset(one.name for one in fleet.nodes), frozenset(task.name for task in fleet.tasks)
-    node.membership.adopt(tuple(one.name for one in fleet.nodes), fleet.timing)
-    node.identity.fleet_file, node.identity.beat_s = node.fleet_file, fleet.timing.beat_s
-    node.namesakes.adopt(fleet.timing.rest_beat_s)
-    node.pace.timing = fleet.timing
-    for name in [name for name in node.namesakes.nodes if name not in names]:
-        node.namesakes.forget(name)
-    node.knocking.adopt(node.fleet_file, names)
-    node.solitude.timing = fleet.timing
-    node.stateless &= names
-    node.fileless &= names
-    node.clear_problems(Problem.FLEET, Problem.OWN_FILE)
-    node.gateway.adopt(fleet)
-    node.probation.adopt(fleet)
-    node.unseen.adopt(tasks, names)
-
-
-def _adopt_choice(node: Stages, fleet: Fleet, anew: AbstractSet[TaskId], todo: ToDo, now: float) -> None:
-    """PROFILE, SCHEDULER and VOTE; of the tasks ``anew`` (`_is_of_before`) nothing is remembered."""
-    node.profiler.adopt(fleet.timing)
-    node.votes.adopt(fleet)
-    node.rounds.adopt(fleet, now, anew)
-    node.agreement.adopt(fleet, todo, now)
-    node.votes.pace(node.agreement.timing)
-    node.unconfirmed = {name: why for name, why in node.unconfirmed.items() if name in node.registers}
-    past = {name: told for name, told in node.history.items() if name not in anew}
-    node.history = {task.name: past.get(task.name) or deque(maxlen=HISTORY) for task in fleet.tasks}
-
-
-def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
+def _change_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     """EXECUTOR and ROUTE: workers, roles and streams of tasks that come, stay and go."""
     kept = dict(node.executors)
     node.executors.clear()  # tenure and sealing go by the same table
@@ -118,18 +89,14 @@ def _adopt_work(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
             del kept[spec.name]
             if _runs_another_program(executor.spec, spec):
                 _learn_anew(node, values[spec.name], now)
-            executor.adopt(spec, todo, now, is_agreed_leased=values[spec.name].leased)
+            executor.on_spec(spec, todo, now, is_agreed_leased=values[spec.name].leased)
         node.executors[spec.name] = executor
     for executor in kept.values():
         executor.end(todo)
-    node.workers.adopt(fleet, node.me, node.busy())
-    node.hangs.adopt(fleet, node.worker_states, now)
-    node.sealing.adopt(fleet)
-    node.tenure.adopt(fleet)
+    node.workers.on_fleet(fleet, node.me, node.busy())
     for name in node.executors:
         node.tenure.hold(values[name], node.beat_sequence + 1)
     for name in kept:
-        node.unready.pop(name, None)
         node.renewing.forget(name)
         node.gateway.forget(name)
         node.set_problem(Problem.RELAY, None, name)
@@ -191,7 +158,7 @@ def _on_fleet(node: Stages, event: ev.FleetChanged, todo: ToDo, now: float) -> N
     if node.agreement.document is not None or _is_refused(node, event.fleet):
         return
     follow(node, event.fleet, todo)
-    adopt(node, in_force(node.fleet, event.fleet), todo, now)
+    go_by(node, in_force(node.fleet, event.fleet), todo, now)
 
 
 HANDLERS: Final[Mapping[type[Any], Handler]] = {

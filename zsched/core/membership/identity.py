@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 
 from zsched.core.values.beat import Beat
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
@@ -61,11 +62,9 @@ class Identity(Struct):
     """This node's knowledge about its own name and file."""
 
     me: NodeId
+    in_force: InForce
     incarnation: int
-    fleet_file: str
     started_at: float
-    beat_s: float
-    """Period of beats: they also count how long another daemon has stayed."""
     _twin: tuple[int, int, float] | None = field(default=None)
     """(incarnation, first sequence, since when) of another daemon with our name."""
     _tokens: set[int] = field(default_factory=set)
@@ -146,7 +145,7 @@ class Identity(Struct):
         if is_younger and now - self.started_at < young_s:
             return Verdict.LEAVE
         # Of a node that stood still itself while the other one came and left, only the time between two beats is long.
-        lived_s = (sequence - self._twin[1]) * self.beat_s
+        lived_s = (sequence - self._twin[1]) * self.in_force.timing.beat_s  # beats also count how long it has stayed
         return Verdict.DISPUTE if min(now - self._twin[2], lived_s) >= STAYS_S else Verdict.TWIN
 
     def file_complaint(self, beat: Beat, path: str = "", *, is_agreed: bool = False) -> str | None:
@@ -154,12 +153,12 @@ class Identity(Struct):
 
         ``is_agreed``: the fleet goes by an agreed document, and no file counts.
         """
-        if beat.fleet_file in ("", self.fleet_file):
+        if beat.fleet_file in ("", self.in_force.file):
             return None
         if is_agreed:
             return (
                 f"{beat.node} does not go by the agreed document that this node goes by ({beat.fleet_file}, here "
-                f"{self.fleet_file}): if that lasts, `zsched status` on that machine says why (its disk may be full)"
+                f"{self.in_force.file}): if that lasts, `zsched status` on that machine says why (its disk may be full)"
             )
-        ours = here(self.fleet_file, path)
+        ours = here(self.in_force.file, path)
         return f"{beat.node} goes by another fleet file ({beat.fleet_file}, {ours}): {ONE_FILE}"

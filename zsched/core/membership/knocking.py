@@ -14,6 +14,7 @@ from __future__ import annotations
 from zsched.core.membership.identity import ONE_FILE, QUIET_S, here
 from zsched.core.values.beat import Beat
 from zsched.core.values.electorate import SAID_DIGITS
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
 from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.struct import Struct, field
@@ -27,13 +28,8 @@ KNOCKERS_KEPT = 4
 class Knocking(Struct):
     """The unknown nodes that one node hears, with its own fleet file's hash."""
 
-    fleet_file: str
+    in_force: InForce
     _heard: dict[NodeId, _Knock] = field(default_factory=dict)
-
-    def adopt(self, fleet_file: str, nodes: frozenset[NodeId]) -> None:
-        """The fleet file has this hash and names these nodes, from now on."""
-        self.fleet_file = fleet_file
-        self._heard = {name: known for name, known in self._heard.items() if name not in nodes}
 
     def on_beat(self, beat: Beat, now: float, *, generation: str = "") -> None:
         """A beat of a node that the fleet file does not name; ``generation`` if it tells of another one than ours."""
@@ -53,7 +49,8 @@ class Knocking(Struct):
         """
         said = dict[ProblemKey, str]()
         for name, known in sorted(self._heard.items()):
-            if now >= known.at + QUIET_S or known.at < known.since + SHOWN_AFTER_S:
+            is_named = name in self.in_force.nodes
+            if is_named or now >= known.at + QUIET_S or known.at < known.since + SHOWN_AFTER_S:
                 continue
             if known.generation:
                 said[Problem.GENERATION, name] = self._apart(name, known.generation, path, is_agreed=is_agreed)
@@ -70,12 +67,12 @@ class Knocking(Struct):
             )
         return (
             f"{name} beats in this fleet, goes by another fleet file ({beat.fleet_file or 'not told'}, "
-            f"{here(self.fleet_file, path)}), and is in no line of this one: {ONE_FILE}"
+            f"{here(self.in_force.file, path)}), and is in no line of this one: {ONE_FILE}"
         )
 
     def _apart(self, name: NodeId, generation: str, path: str, *, is_agreed: bool) -> str:
         """A stranger that our document does not name: an order there would change its half, not ours."""
-        ours = "the document agreed here" if is_agreed else f"this node's fleet file ({here(self.fleet_file, path)})"
+        ours = "the document agreed here" if is_agreed else f"this node's fleet file ({here(self.in_force.file, path)})"
         return (
             f"{name} counts by another generation of this fleet, {generation[:SAID_DIGITS]}, and "
             f"{ours} does not name it; nothing passes between them. The side that has a quorum stays. To bring {name} "

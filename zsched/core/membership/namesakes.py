@@ -15,6 +15,7 @@ import math
 
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.values.beat import Beat
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
@@ -55,25 +56,15 @@ class _Name(Struct):
 class Namesakes:
     """The daemons with a shared name that one node hears."""
 
-    def __init__(self, beat_s: float) -> None:
-        self.adopt(beat_s)
-        self._names: dict[NodeId, _Name] = {}
-        self._watched: dict[NodeId, _Name] = {}
+    def __init__(self, in_force: InForce) -> None:
+        self._in_force = in_force
+        self._names: dict[NodeId, _Name] = in_force.by_node()
+        self._watched: dict[NodeId, _Name] = in_force.by_node()
         """Names with two tokens: usually none. The set is kept because thirty beats a second are looked up."""
 
-    def adopt(self, beat_s: float) -> None:
-        """The fleet file says this period of beats, from now on."""
-        self._beside_s = max(BESIDE_S, BESIDE_BEATS * beat_s)
-
-    def forget(self, node: NodeId) -> None:
-        """The fleet file does not name that node any more."""
-        self._names.pop(node, None)
-        self._watched.pop(node, None)
-
     @property
-    def nodes(self) -> tuple[NodeId, ...]:
-        """The nodes of which something is known."""
-        return tuple(sorted(self._names))
+    def _beside_s(self) -> float:
+        return max(BESIDE_S, BESIDE_BEATS * self._in_force.timing.rest_beat_s)
 
     def on_token(self, node: NodeId, incarnation: int, *, is_present: bool) -> None:
         """A peer's token came or went."""

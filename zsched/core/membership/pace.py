@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 from zsched.core.values.beat import Beat
-from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.struct import Struct, replace
 
 FULL_S = 5.0
@@ -22,7 +22,7 @@ FULL_S = 5.0
 class Pace(Struct):
     """The pace of one node's beats."""
 
-    timing: Timing
+    in_force: InForce
     _full_until: float = -math.inf
     _said: Beat | None = None
     """What the newest beat said, without what changes with each."""
@@ -50,11 +50,11 @@ class Pace(Struct):
         ``are_all_calm``: every living peer's newest beat says so.
         """
         self.is_slow = beat.calm and are_all_calm
-        return self._sent_at + (self.timing.rest_beat_s if self.is_slow else self.timing.beat_s)
+        return self._sent_at + (self.in_force.timing.rest_beat_s if self.is_slow else self.in_force.timing.beat_s)
 
     def hasten(self, due_at: float, now: float) -> float:
         """Something goes on, here or elsewhere: when the beat is due that was due at ``due_at``."""
         if not self.is_slow:
             return due_at
         self.is_slow, self._full_until = False, now + FULL_S
-        return min(due_at, max(now, self._sent_at + self.timing.beat_s))
+        return min(due_at, max(now, self._sent_at + self.in_force.timing.beat_s))

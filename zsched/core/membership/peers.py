@@ -28,6 +28,7 @@ from collections.abc import Callable, Mapping
 from zsched.core.sequence import Order, Track
 from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, PeerState, TaskId
 from zsched.core.values.struct import Struct, field
 
@@ -95,9 +96,9 @@ class _Peer(Struct):
 class Membership:
     """This node's view of every other configured node's state."""
 
-    def __init__(self, me: NodeId, nodes: tuple[NodeId, ...], timing: Timing) -> None:
-        self._me = me
-        self._peers: dict[NodeId, _Peer] = {}
+    def __init__(self, me: NodeId, in_force: InForce) -> None:
+        self._me, self._in_force = me, in_force
+        self._peers = in_force.by_node(lambda _name: _Peer(), but=me)
         self._lag_factor = 1.0
         self._held_up_at = -math.inf
         """When a beat that was held up came last."""
@@ -107,22 +108,16 @@ class Membership:
         self._has_heard = False
         self.has_watched = False
         """Whether this node has listened for as long as silence takes to mean something."""
-
-        self.adopt(nodes, timing)
-
-    def adopt(self, nodes: tuple[NodeId, ...], timing: Timing) -> None:
-        """The fleet file names these nodes and times, from now on: what is known of a node that stays is kept."""
-        self._timing = timing
-        self._size = len(nodes)
-        self._peers = {name: self._peers.get(name) or _Peer() for name in sorted(nodes) if name != self._me}
-        self._states = {
-            name: PeerState.ALIVE if name == self._me else self._peers[name].state for name in sorted(nodes)
-        }
-        self._has_suspect = PeerState.SUSPECT in self._states.values()
-        self._misses_anybody = any(state is not PeerState.ALIVE for state in self._states.values())
-        self._has_heard |= not self._peers
         self._deadline: float | None = None
-        """`next_deadline`, until something changes it."""
+        """`next_deadline`, until a peer changes it; by another fleet's clocks from the next beat on."""
+
+    @property
+    def _timing(self) -> Timing:
+        return self._in_force.timing
+
+    @property
+    def _has_suspect(self) -> bool:
+        return any(peer.state is PeerState.SUSPECT for peer in self._peers.values())
 
     # --- queries -----------------------------------------------------------------------------------------------
 
@@ -139,7 +134,7 @@ class Membership:
 
     def states(self) -> dict[NodeId, PeerState]:
         """{node: state} of the whole fleet, this node included, sorted by name."""
-        return self._states
+        return {name: self.state(name) for name in self._in_force.nodes}
 
     def incarnation(self, node: NodeId) -> int | None:
         """The newest incarnation that a peer's beat showed, or ``None``."""
@@ -196,7 +191,7 @@ class Membership:
     @property
     def misses_anybody(self) -> bool:
         """Whether some node of the fleet file is not heard."""
-        return self._misses_anybody
+        return any(peer.state is not PeerState.ALIVE for peer in self._peers.values())
 
     @property
     def are_calm(self) -> bool:
@@ -217,12 +212,12 @@ class Membership:
     @property
     def gone(self) -> tuple[NodeId, ...]:
         """Who is gone, in the order of the fleet file."""
-        return tuple(name for name, state in self._states.items() if state is PeerState.GONE)
+        return tuple(name for name, peer in self._peers.items() if peer.state is PeerState.GONE)
 
     @property
     def has_heard(self) -> bool:
         """Whether any peer was ever heard; also true of a node without peers."""
-        return self._has_heard
+        return self._has_heard or not self._peers
 
     # --- what changes it ---------------------------------------------------------------------------------------
 
@@ -364,7 +359,7 @@ class Membership:
 
     def _grace(self, peer: _Peer) -> float:
         """How long a suspect stays so before it is gone without another observer."""
-        if self._size <= SMALL_FLEET:
+        if len(self._in_force.nodes) <= SMALL_FLEET:
             return 1.5 * self._timing.beat_s * self._lag_factor if peer.token_lost else 0.0
         return self._timing.confirm_s * self._lag_factor
 
@@ -394,7 +389,8 @@ class Membership:
     def _verdict(self, name: NodeId, peer: _Peer, now: float) -> str:
         if (reason := self._accused_by(name)) or now < self._review_at(peer):
             return reason
-        if self._size > SMALL_FLEET and any(at.beat_at > peer.suspect_since for _, at in self._observers(name)):
+        is_heard = any(at.beat_at > peer.suspect_since for _, at in self._observers(name))
+        if len(self._in_force.nodes) > SMALL_FLEET and is_heard:
             # A living node still hears it: a cut between it and us, not its end. A silent node speaks for no peer.
             peer.vouched_until = now + self._timing.beat_s
             return ""
@@ -405,9 +401,6 @@ class Membership:
         before, peer.state = peer.state, after
         if after is not PeerState.SUSPECT:
             peer.has_been_gone = after is PeerState.GONE
-        self._states = {**self._states, node: after}  # a new one: whoever holds the old one sees one moment
-        self._has_suspect = PeerState.SUSPECT in self._states.values()
-        self._misses_anybody = any(state is not PeerState.ALIVE for state in self._states.values())
         self._deadline = None
         peer.suspect_since = now if after is PeerState.SUSPECT else math.inf
         peer.vouched_until = -math.inf

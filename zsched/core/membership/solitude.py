@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.struct import Struct
 
 ALONE_S = 3.0
@@ -28,7 +28,7 @@ CHECK = "Check host, port, firewall, and that every node has the same `fleet:`"
 class Solitude(Struct):
     """Of one node: when to try its addresses, and what its status says while nobody was ever heard."""
 
-    timing: Timing
+    in_force: InForce
     started_at: float
     dialled: tuple[str, ...] = ()
     """The addresses that its control session dials."""
@@ -39,7 +39,7 @@ class Solitude(Struct):
 
     def is_alone(self, now: float, *, has_heard: bool) -> bool:
         """Whether nobody was heard for longer than it takes to connect; monotonic seconds."""
-        return not has_heard and now >= self.started_at + max(ALONE_S, 2 * self.timing.suspect_s)
+        return not has_heard and now >= self.started_at + max(ALONE_S, 2 * self.in_force.timing.suspect_s)
 
     def must_try(self, now: float, *, has_heard: bool) -> bool:
         """Whether to try the addresses now; ask often."""

@@ -129,7 +129,7 @@ class Profiler:
         self._sent_at = -math.inf
         self._sequence = 0
 
-    def adopt(self, timing: Timing) -> None:
+    def retune(self, timing: Timing) -> None:
         """Go by other times: every mean goes on from where it is, with the time constant that is its own now.
 
         None begins anew: until a worker's share had risen again, the worker would look like other programs' load.

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from enum import StrEnum
 from random import Random
 from typing import Generic
@@ -30,6 +31,7 @@ from typing import Generic
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
 from zsched.core.values.electorate import Electorate, electorate_of
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, V
 from zsched.core.values.quorum import majority
@@ -40,6 +42,7 @@ BACKOFF_CAP_S = 5.0
 MAX_REVISION = 2**52  # half of what a counter may be: a value so far ahead is refused, for nothing could follow it
 MAX_JUMP = 2**32  # no honest counter is so far ahead; one hostile frame must not use them all up
 ROUND_BALLOTS = 6
+SETTLE_BALLOTS = 3
 """A change is given up so many times ``ballot_s`` after it began."""
 MAX_QUEUED = 16
 """Changes that may wait for the round under way; one more ends as a conflict, for those before it come first."""
@@ -56,7 +59,10 @@ class _Round(Struct, Generic[V]):
     """One proposer's attempts at one change (or, without a change, an identity round)."""
 
     change: Rewrite[V] | None
-    give_up_at: float
+    since: float
+    """When it began (monotonic seconds); later by what this loop stood still."""
+    ballots: float
+    """It is given up after so many of a ballot's deadlines."""
     phase: _Phase = _Phase.WAIT
     deadline: float = 0.0
     ballot: Ballot | None = None
@@ -89,8 +95,7 @@ class Register(ABC, Generic[V]):
         is_elector: bool,
         initial: V,
         state: RegisterState[V],
-        ballot_s: float,
-        stagger_s: float,
+        clocks: Callable[[], Timing],
         rng: Random,
         disk: str = "",
     ) -> None:
@@ -98,7 +103,7 @@ class Register(ABC, Generic[V]):
         self._count, self._electorate = electorate_of(electors), electorate
         self._is_elector = is_elector
         self._initial = initial
-        self._ballot_s, self._stagger_s, self._rng = ballot_s, stagger_s, rng
+        self._clocks, self._rng = clocks, rng
         self.state = state
         self.problem = ""
         """Why agreement stands still; the next learnt value ends it."""
@@ -140,26 +145,17 @@ class Register(ABC, Generic[V]):
                 task=self.state.task, creation=self.state.creation
             )  # it never promised anything, and this was another fleet's
 
-    def adopt(self, initial: V, *, ballot_s: float, stagger_s: float) -> None:
-        """Go by another fleet file; its first value holds while nothing was learnt.
-
-        Args:
-            initial: that first value.
-            ballot_s: deadline of one phase, seconds.
-            stagger_s: wait per rank, seconds.
-        """
+    def begin_with(self, initial: V) -> None:
+        """Another fleet is in force; its first value holds while nothing was learnt."""
         self._initial = initial
-        self.adopt_clocks(ballot_s=ballot_s, stagger_s=stagger_s)
 
-    def adopt_clocks(self, *, ballot_s: float, stagger_s: float) -> None:
-        """Go by other clocks (arguments as of `adopt`), with the next phase: what is under way has more time, or less.
+    @property
+    def _ballot_s(self) -> float:
+        """Deadline of one phase, by the clocks in force."""
+        return self._clocks().ballot_s
 
-        What was asked by the old ones is asked again when it was due: answers to it may have come too late.
-        """
-        self._settle_at += 2 * (ballot_s - self._ballot_s)
-        if self._round is not None:
-            self._round.give_up_at += ROUND_BALLOTS * (ballot_s - self._ballot_s)
-        self._ballot_s, self._stagger_s = ballot_s, stagger_s
+    def _gives_up_at(self, running: _Round[V]) -> float:
+        return running.since + running.ballots * self._ballot_s
 
     def count_with(self, count: Electorate, *, is_elector: bool, is_blank: bool, now: float) -> None:
         """A newer fleet value is learnt: rounds count with its electors, and the one under way begins again.
@@ -397,7 +393,7 @@ class Register(ABC, Generic[V]):
             self.propose(change, todo, now)
             return
         running.change, running.is_ahead = change, False
-        running.give_up_at = now + ROUND_BALLOTS * self._ballot_s
+        running.since, running.ballots = now, ROUND_BALLOTS
         if self._outcome_by(self.value) is not None:
             self._finish(todo, RoundOutcome.CONFLICT, now)
         elif running.phase is _Phase.HELD:
@@ -410,13 +406,13 @@ class Register(ABC, Generic[V]):
         one has overtaken it, the change is refused, and its end may be unknown: who wants it looks, and tries again.
         """
         if self._round is None:
-            self._round = _Round(change=None, give_up_at=now + ROUND_BALLOTS * self._ballot_s, is_ahead=True)
+            self._round = _Round(change=None, since=now, ballots=ROUND_BALLOTS, is_ahead=True)
             self._prepare(todo, now)
 
     def settle(self, todo: ToDo, now: float) -> None:
         """Run an identity round, unless a round is under way: learn the earlier acceptances."""
         if self._round is None:
-            self._round = _Round(change=None, give_up_at=now + 3 * self._ballot_s)
+            self._round = _Round(change=None, since=now, ballots=SETTLE_BALLOTS)
             if self._is_unlearnt() and self._settle_at == math.inf:
                 self._settle_at = now + 2 * self._ballot_s  # after a restart nobody else asks again
             self._prepare(todo, now)
@@ -425,7 +421,7 @@ class Register(ABC, Generic[V]):
         """Begin with the next change that is not outdated; those before it end."""
         while self._queue and self._round is None:
             change = self._queue.pop(0)
-            self._round = _Round(change=change, give_up_at=now + ROUND_BALLOTS * self._ballot_s)
+            self._round = _Round(change=change, since=now, ballots=ROUND_BALLOTS)
             if self._outcome_by(self.value) is None:
                 self._prepare(todo, now)
             else:
@@ -511,7 +507,7 @@ class Register(ABC, Generic[V]):
             self._again(running, todo, now)
             return
         if running.is_ahead and read.revision == self.value.revision:
-            running.phase, running.deadline = _Phase.HELD, running.give_up_at
+            running.phase, running.deadline = _Phase.HELD, self._gives_up_at(running)
             return
         is_identity = running.change is None or running.sent is not None
         if is_identity and newest is None:
@@ -582,7 +578,7 @@ class Register(ABC, Generic[V]):
 
         A new ballot would be another write everywhere, and of an accept it could only find out the outcome.
         """
-        if now >= running.give_up_at:
+        if now >= self._gives_up_at(running):
             self._give_up(running, todo, now)
             return
         assert running.ballot is not None
@@ -611,7 +607,7 @@ class Register(ABC, Generic[V]):
         Once our own accept has left, the higher ballot only finds out its outcome.
         """
         wait = self._jitter(running.attempt)
-        if now + wait >= running.give_up_at:
+        if now + wait >= self._gives_up_at(running):
             self._give_up(running, todo, now)
             return
         running.attempt += 1
@@ -630,15 +626,15 @@ class Register(ABC, Generic[V]):
 
     def _jitter(self, attempt: int) -> float:
         """Doubling back-off with jitter, so that duelling proposers part."""
-        base = self._stagger_s * 2.0 ** min(attempt, 16)  # bounded: a cut may last for days
+        base = self._clocks().stagger_s * 2.0 ** min(attempt, 16)  # bounded: a cut may last for days
         return min(base, BACKOFF_CAP_S) * (0.5 + self._rng.random())
 
     def tick(self, todo: ToDo, now: float) -> None:
         """Time has passed."""
         running = self._round
         if running is not None and now >= running.deadline:
-            running.give_up_at += now - running.deadline  # this loop stood still meanwhile, maybe in its own write
-            if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, running.give_up_at)):
+            running.since += now - running.deadline  # this loop stood still meanwhile, maybe in its own write
+            if running.phase is _Phase.WAIT and now < (until := min(self._lease_over_at, self._gives_up_at(running))):
                 running.deadline = until  # our next ballot would end the accept that waits
             elif running.phase is _Phase.WAIT:
                 self._prepare(todo, now)  # no newer value has come: that would have ended the round

@@ -20,7 +20,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from zsched.core.values.fleet import Fleet, Standby, TaskSpec
+from zsched.core.values.fleet import Standby, TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.struct import Struct, field
@@ -40,21 +41,15 @@ class _Return(Struct):
 class Probation(Struct):
     """What one robot knows of the streams to nodes that were gone."""
 
-    fleet: Fleet
+    in_force: InForce
     _returns: dict[NodeId, _Return] = field(default_factory=dict)
     _tokens: dict[tuple[NodeId, TaskId], dict[str, float]] = field(default_factory=dict)
     """{(node, task): {worker's incarnation: when its token came}} of the tokens that are there."""
 
-    def adopt(self, fleet: Fleet) -> None:
-        """Go by ``fleet``; who was gone and is not in it is forgotten.
-
-        Tokens stay, also of nodes and tasks that it does not name: another node may have adopted a document before us,
-        and its worker shows itself once. Our relay bounds them (`zsched.relay.tokens`).
-        """
-        self.fleet = fleet
-        nodes = {node.name for node in fleet.nodes}
-        for node in [node for node in self._returns if node not in nodes]:
-            del self._returns[node]
+    def __post_init__(self) -> None:
+        # Not so tokens: another node may go by a document before us, and its worker shows itself once. Our relay
+        # bounds them (`zsched.relay.tokens`).
+        self._returns = self.in_force.by_node()
 
     def on_gone(self, node: NodeId, now: float) -> None:
         """A peer is gone: what was known of its streams is worth nothing any more."""
@@ -102,7 +97,7 @@ class Probation(Struct):
         if any(at > known.gone_at for at in tokens.values()):
             return ""
         has_stood = bool(tokens) or not shows_token(spec)
-        if has_stood and back_s >= self.fleet.timing.zenoh_lease_s + LEASE_MARGIN_S:
+        if has_stood and back_s >= self.in_force.timing.zenoh_lease_s + LEASE_MARGIN_S:
             return ""
         return f"back for {back_s:.1f} s, its streams are not proven yet"
 

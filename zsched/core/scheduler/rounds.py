@@ -35,7 +35,8 @@ from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
 from zsched.core.scheduler.usage import book
 from zsched.core.todo import ToDo
 from zsched.core.values.decision import Decision, Figures, Need, Rules
-from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     MAX_AGGREGATE,
@@ -127,7 +128,7 @@ class Rounds:
 
     def __init__(
         self,
-        fleet: Fleet,
+        in_force: InForce,
         me: NodeId,
         gateway: Gateway,
         turns: Mapping[TaskId, Turn],
@@ -141,37 +142,26 @@ class Rounds:
         self._me, self._gateway, self._turns, self._rng = me, gateway, turns, rng
         self._doubts = doubts
         self._round_trips = round_trips or RoundTrips(me)
+        self._in_force = in_force
         self.tasks: dict[TaskId, TaskRound] = {}
-        self._adopt(fleet, now)
+        self._gather: _Gather | None = None
+        self.on_fleet(now)
         self._number = 0
         self._round_at = now if self.is_voter else math.inf
 
-    def adopt(self, fleet: Fleet, now: float, anew: AbstractSet[TaskId] = frozenset()) -> None:
-        """Take tasks, robots and times from ``fleet``: what is remembered of a task that stays is kept.
+    def on_fleet(self, now: float, anew: AbstractSet[TaskId] = frozenset()) -> None:
+        """Another fleet is in force; what is remembered of a task that stays is kept, but for those ``anew``.
 
-        ``anew``: tasks that are others than those of before, by the same name.
         A gather under way ends without a judgement, for it has asked the robots of before; another one follows at once.
         """
-        was_gathering = self._gather is not None
-        self.tasks = {name: task for name, task in self.tasks.items() if name not in anew}
-        self._adopt(fleet, now)
-        if was_gathering:
-            self.hurry(now)
-
-    def _adopt(self, fleet: Fleet, now: float) -> None:
-        self._fleet = fleet
-        self.is_voter = self._me in fleet.voters
-        self.voters = fleet.voters
-        """The robots that count: a majority of them must have been heard."""
-        self.electors = fleet.electors
-        kept = self.tasks
+        kept = {name: task for name, task in self.tasks.items() if name not in anew}
         self.tasks = {
-            spec.name: TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now)
-            if spec.name not in kept
-            else kept[spec.name].by(spec)
-            for spec in fleet.tasks
+            name: kept[name].by(spec) if name in kept else TaskRound(spec=spec, judge=Judge(spec=spec), settled_at=now)
+            for name, spec in self._in_force.tasks.items()
         }
-        self._gather: _Gather | None = None
+        if self._gather is not None:
+            self._gather = None
+            self.hurry(now)
         nothing = Utilities(voter=self._me, vectors=())
         self._answer: tuple[int, float, object, Utilities] = (-1, -math.inf, None, nothing)
         """(gateway's version, until when, (states, values, doubts), vectors): the newest answer to a gather."""
@@ -179,10 +169,15 @@ class Rounds:
         self._must_ask = True
         """Something has happened since the last gather that may need a decision."""
 
-    def count_with(self, voters: tuple[NodeId, ...], electors: tuple[NodeId, ...]) -> None:
-        """These robots and electors count from now on."""
-        self.voters, self.electors = voters, electors
-        self._must_ask = True
+    @property
+    def is_voter(self) -> bool:
+        """Whether this node is a robot."""
+        return self._me in self._in_force.fleet.voters
+
+    @property
+    def voters(self) -> tuple[NodeId, ...]:
+        """The robots that count: a majority of them must have been heard."""
+        return self._in_force.voters
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -255,7 +250,7 @@ class Rounds:
         self, values: Mapping[TaskId, Allocation], states: Mapping[NodeId, PeerState], todo: ToDo, now: float
     ) -> list[NodeId]:
         """Start a gather; the other robots that it asks: none while all is at rest (`zsched.core.scheduler.rest`)."""
-        timing = self._fleet.timing
+        timing = self._in_force.timing
         self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
         self._number += 1
         own = self.vectors(values, states, now)
@@ -278,7 +273,7 @@ class Rounds:
     def _rests(self, own: tuple[UtilityVector, ...], states: Mapping[NodeId, PeerState], now: float) -> bool:
         """Whether the answers of the last gather still hold, so that nobody need be asked."""
         kept = self._kept
-        if kept is None or self._must_ask or now >= kept.at + self._fleet.timing.profile_ttl_s:
+        if kept is None or self._must_ask or now >= kept.at + self._in_force.timing.profile_ttl_s:
             return False
         judgements = (task.judgement for task in self.tasks.values())
         stays = all(one is not None and one.outcome is Outcome.STAY for one in judgements)
@@ -403,8 +398,8 @@ class Rounds:
             voters=self.voters,
             present=tuple([voter for voter in self.voters if states[voter] is not gone]),
             vectors=vectors,
-            electors=self.electors,
-            electors_heard=tuple([one for one in self.electors if states.get(one, gone) in HEARD]),
+            electors=self._in_force.electors,
+            electors_heard=tuple([one for one in self._in_force.electors if states.get(one, gone) in HEARD]),
             settled_for_s=now - task.settled_at,
             owner_state=gone if owner is None else states.get(owner, gone),
             owner_profile=profile,

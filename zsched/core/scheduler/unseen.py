@@ -18,11 +18,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from collections.abc import Set as AbstractSet
 
 from zsched.core.absence import Absences
 from zsched.core.scheduler.probation import Probation, shows_token
 from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct, field
 
@@ -35,6 +35,7 @@ LONGEST_GAP_S = 5.0
 class Unseen(Struct):
     """What one robot knows of candidates that no stream of its own reaches."""
 
+    in_force: InForce
     found: dict[TaskId, frozenset[NodeId]] = field(default_factory=dict)
     """{task: the candidates that were found so when last looked}."""
     _absences: dict[TaskId, dict[NodeId, Absences]] = field(default_factory=dict)
@@ -42,18 +43,13 @@ class Unseen(Struct):
     _looked_at: float = -math.inf
     """When last, for any task: all are looked at together."""
 
+    def __post_init__(self) -> None:
+        self.found, self._absences = self.in_force.by_task(), self.in_force.by_task()
+
     def forget(self) -> None:
         """Our relay is another one: it tells anew what it sees."""
         self._absences.clear()
         self.found.clear()
-
-    def adopt(self, tasks: AbstractSet[TaskId], nodes: AbstractSet[NodeId]) -> None:
-        """What was known of other tasks and nodes is forgotten: one of the same name that comes later is another."""
-        for task in [task for task in self.found if task not in tasks]:
-            del self.found[task]
-            self._absences.pop(task, None)
-        for task, known in self._absences.items():
-            self._absences[task] = {name: one for name, one in known.items() if name in nodes}
 
     def look(
         self,

@@ -15,7 +15,7 @@ from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
-from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused, fleet_answer
 from zsched.core.values.model import Ballot, NodeId, TaskId
 from zsched.core.vote.belief import is_fit, is_fleet_fit
@@ -33,7 +33,7 @@ class Acceptor:
     """The answers of one node to proposers.
 
     Args:
-        fleet: what the node goes by.
+        in_force: the fleet that the node goes by.
         registers: its tasks' registers; the table changes with the fleet.
         numbers: its fleet register.
         witness: what others remember of it.
@@ -45,7 +45,7 @@ class Acceptor:
     def __init__(
         self,
         *,
-        fleet: Fleet,
+        in_force: InForce,
         registers: Mapping[TaskId, TaskRegister],
         numbers: Numbers,
         witness: Witness,
@@ -56,15 +56,9 @@ class Acceptor:
         self.is_elector = is_elector
         self.registers, self.witness, self.leases, self.counters = registers, witness, leases, counters
         self._numbers = numbers
-        self._buckets: dict[NodeId, tuple[float, float]] = {}
+        self._in_force = in_force
+        self._buckets: dict[NodeId, tuple[float, float]] = in_force.by_node()
         self._parked: dict[tuple[TaskId, NodeId], tuple[ev.AcceptAsked, float]] = {}
-        self.adopt(fleet)
-
-    def adopt(self, fleet: Fleet) -> None:
-        """Take nodes and times from ``fleet``; what waits for a task that has gone goes with it."""
-        self._fleet, self._nodes = fleet, frozenset(node.name for node in fleet.nodes)
-        self._buckets = {node: bucket for node, bucket in self._buckets.items() if node in self._nodes}
-        self._parked = {key: known for key, known in self._parked.items() if key[0] in self.registers}
 
     def next_deadline(self) -> float:
         """When a question has waited long enough; infinity: none waits."""
@@ -74,8 +68,10 @@ class Acceptor:
         """Registers count by another number: what waits for a task that has gone is refused."""
         roll = self._numbers.roll
         for key, (event, _) in tuple(self._parked.items()):
-            if roll is not None and key[0] not in self.registers:
-                del self._parked[key]
+            if key[0] in self.registers:
+                continue
+            del self._parked[key]
+            if roll is not None:
                 todo.add(do.AnswerElection(request=event.request, answer=roll.refused(event.accept)))
 
     def on_prepare(self, event: ev.PrepareAsked, todo: ToDo, now: float, *, may_ask: bool | None = None) -> None:
@@ -144,7 +140,7 @@ class Acceptor:
         if self._numbers.is_foreign(event.accept):
             self.counters["accept_stranger"] += 1
             return
-        if not is_fit(self._fleet, acceptance.value, register):
+        if not is_fit(self._in_force.fleet, acceptance.value, register):
             self.counters["accept_unfit"] += 1
             refused = register.refuse(acceptance.ballot, Refusal.VALUE)
         elif (turned_away := self._numbers.turned_away(event.accept, event.asker, todo)) is not None:
@@ -152,7 +148,7 @@ class Acceptor:
         elif self.is_elector and not self.witness.may_vote(now):
             refused = register.refuse(acceptance.ballot, Refusal.YOUNG)
         else:
-            at_most = PARK_SHARE * self._fleet.timing.ballot_s if park_s is None else park_s
+            at_most = PARK_SHARE * self._in_force.timing.ballot_s if park_s is None else park_s
             self._accept_or_park(event, now + at_most, todo, now)
             return
         todo.add(do.AnswerElection(request=event.request, answer=refused))
@@ -199,7 +195,7 @@ class Acceptor:
 
         Who is no node has no bucket: inventing names takes no memory.
         """
-        if asker not in self._nodes:
+        if asker not in self._in_force.nodes:
             return False
         tokens, at = self._buckets.get(asker, (PREPARE_BURST, now))
         tokens = min(tokens + (now - at) * PREPARES_PER_S, PREPARE_BURST)
@@ -208,4 +204,4 @@ class Acceptor:
         return may_ask
 
     def _is_its_own(self, ballot: Ballot, asker: NodeId) -> bool:
-        return ballot.node == asker and asker in self._nodes
+        return ballot.node == asker and asker in self._in_force.nodes

@@ -28,6 +28,7 @@ from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import TOLD_DIGITS, Creation, Elector, FleetValue, terms_of
 from zsched.core.values.fleet import Fleet, TaskSpec, Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accepted, FleetQuestion, Learnt, Promise, Refused, votes_of
 from zsched.core.values.model import NO_BALLOT, Allocation, NodeId, RegisterState, TaskId
@@ -42,8 +43,6 @@ from zsched.core.vote.lease import Leases
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, Questions
 from zsched.core.vote.witness import Witness, as_seen, as_tuple
 
-HELM_BALLOTS = 2
-"""Each elector proposes a change of the electors so many times ``ballot_s`` after the one before."""
 SETTLE = "`zsched fleet recover --settle`, with its daemon stopped"
 SETTLE_AFTER_START_S = 0.3
 """A starting elector learns first what was accepted before (an identity round), once its peers are connected."""
@@ -53,7 +52,7 @@ class Agreement:
     """All registers of one node.
 
     Args:
-        fleet: the validated fleet file.
+        in_force: the fleet that the node goes by.
         me: this node's name.
         durable: what the state file holds; ``None``: this node is no elector.
         incarnation: this start's number, part of every ballot.
@@ -67,7 +66,7 @@ class Agreement:
     def __init__(
         self,
         *,
-        fleet: Fleet,
+        in_force: InForce,
         me: NodeId,
         durable: DurableState | None,
         incarnation: int,
@@ -77,9 +76,8 @@ class Agreement:
         stored: Mapping[str, Fleet] = MappingProxyType({}),
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
-        self._fleet, self._me = fleet, me
-        self._timing, self.pace_s = fleet.timing, 0.0
-        self._nodes = frozenset(node.name for node in fleet.nodes)
+        self._in_force, self._me = in_force, me
+        fleet = in_force.fleet
         self._durable = durable
         self.generation = None if durable is None else durable.generation
         """``None``: this node has no state, and has not been told yet which one the fleet is of."""
@@ -96,7 +94,7 @@ class Agreement:
         self.witness = Witness(
             me=me,
             electors=fleet.electors,
-            nodes=self._nodes,
+            in_force=in_force,
             incarnation=incarnation,
             votes=0 if durable is None else durable.votes,
             started_at=now,
@@ -126,7 +124,7 @@ class Agreement:
         # A task that left the fleet file may come back: its promises must not be forgotten.
         self._foreign = tuple(states[name] for name in sorted(states) if name not in self.registers)
         self._numbers = Numbers(
-            fleet=fleet,
+            here=in_force,
             me=me,
             durable=durable,
             incarnation=incarnation,
@@ -137,8 +135,8 @@ class Agreement:
             flags=flags,
         )
         self.orders = Orders(self._numbers)
-        self.strangers = Strangers(fleet=fleet.name, silence_s=fleet.timing.suspect_s)
-        self.helm = Helm(self._numbers, me, stagger_s=HELM_BALLOTS * fleet.timing.ballot_s, now=now)
+        self.strangers = Strangers(in_force=in_force)
+        self.helm = Helm(self._numbers, me, clocks=self._clocks, now=now)
         self.at_start = ToDo()
         """What the first batch must do: fetch a document that is missing."""
         if self.generation is not None:
@@ -148,7 +146,7 @@ class Agreement:
         """When what was learnt is written at the latest."""
         self._questions = Questions()
         self.leases = Leases(
-            fleet=fleet,
+            in_force=in_force,
             me=me,
             incarnation=incarnation,
             standing=self.standing() if is_elector else {},
@@ -158,7 +156,7 @@ class Agreement:
         if durable is not None and self._numbers.is_waiting:
             self.leases.terms = terms_of(durable.joins, 0)  # beats tell what this node is to join
         self.acceptor = Acceptor(
-            fleet=fleet,
+            in_force=in_force,
             registers=self.registers,
             numbers=self._numbers,
             witness=self.witness,
@@ -186,8 +184,7 @@ class Agreement:
             initial=task.first_value(state.creation * CREATION_STEP),
             state=state,
             disk="" if self._durable is None else self._durable.disk,
-            ballot_s=self._fleet.timing.ballot_s,
-            stagger_s=self._fleet.timing.stagger_s,
+            clocks=self._clocks,
             rng=self._rng,
         )
 
@@ -200,59 +197,42 @@ class Agreement:
         held = (one for one in self._foreign if (one.task, one.creation) == (creation.task, creation.number))
         return next(held, None)
 
-    def adopt(self, fleet: Fleet, todo: ToDo, now: float) -> None:
-        """Take nodes, tasks and times from ``fleet``, with the electors in force; changes of tasks that go end.
+    def on_fleet(self, todo: ToDo, now: float) -> None:
+        """Another fleet is in force: registers of its tasks begin, changes of tasks that go end.
 
         The roll has the registers of an agreed document already. By a file, the state of a register whose task goes is
         kept, for the task may come back.
         """
-        self._timing = fleet.timing
-        self._nodes = self.witness.nodes = frozenset(node.name for node in fleet.nodes)
-        fleet = self._paced(fleet)
-        self.strangers.silence_s = fleet.timing.suspect_s
-        for node in [node for node in self.behind if node not in self._nodes]:
+        for node in [node for node in self.behind if node not in self._in_force.nodes]:
             self._show_no_more(node)
         kept = dict(self.registers)
         self.registers.clear()  # the roll goes by the same table
         away = {state.task: state for state in self._foreign}
-        for task in fleet.tasks:
+        for task in self._in_force.fleet.tasks:
             register, remembered = kept.pop(task.name, None), away.pop(task.name, None)
             if register is None:
                 state = remembered or self._blank(task.name, self._numbers.changed)
                 register = self._register(task, state, self.is_elector)
                 self._numbers.count_in(register, now)
                 self._settle_at = now + SETTLE_AFTER_START_S if self.is_elector else math.inf
-            first = task.first_value(register.state.creation * CREATION_STEP)
-            register.adopt(first, ballot_s=fleet.timing.ballot_s, stagger_s=fleet.timing.stagger_s)
+            register.begin_with(task.first_value(register.state.creation * CREATION_STEP))
             self.registers[task.name] = register
         for register in kept.values():
             register.close(todo)
             if register.state != RegisterState(task=register.state.task, creation=register.state.creation):
                 away[register.state.task] = register.state
         self._foreign = tuple(away[name] for name in sorted(away))
-        self.acceptor.adopt(fleet)
+        self.acceptor.refuse_gone(todo)
         self._seen = []
-        self.leases.adopt(fleet, self.standing() if self.is_elector else {}, now)
+        self.leases.on_tasks(self.standing() if self.is_elector else {}, now)
         todo.must_persist |= self.must_persist
 
     @property
-    def timing(self) -> Timing:
-        """The clocks by which this node votes."""
-        return self._fleet.timing
+    def _fleet(self) -> Fleet:
+        return self._in_force.fleet
 
-    def pace(self, save_s: float) -> None:
-        """Go by clocks that leave room for saves of ``save_s``."""
-        self.pace_s = save_s
-        self.acceptor.adopt(self._paced(self._fleet))
-        for register in self.registers.values():
-            register.adopt_clocks(ballot_s=self.timing.ballot_s, stagger_s=self.timing.stagger_s)
-
-    def _paced(self, fleet: Fleet) -> Fleet:
-        """Go by ``fleet``, with clocks that leave room for the disks."""
-        self._fleet = replace(fleet, timing=self._timing.paced(self.pace_s))
-        self._numbers.adopt(self._fleet)
-        self.helm.adopt(stagger_s=HELM_BALLOTS * self.timing.ballot_s)
-        return self._fleet
+    def _clocks(self) -> Timing:
+        return self._in_force.timing
 
     @property
     def _by_file(self) -> str:
@@ -417,7 +397,7 @@ class Agreement:
 
         An elector that has itself accepted this very value takes its word; everybody else asks.
         """
-        if teller == self._me or teller not in self._nodes:
+        if teller == self._me or teller not in self._in_force.nodes:
             return
         if self._numbers.has_accepted(value):
             if self._numbers.learn(value, teller, todo, now):
@@ -428,7 +408,7 @@ class Agreement:
     def on_fleet_answer(self, event: ev.FleetAnswered, todo: ToDo, now: float) -> None:
         """An elector answered our question to its fleet register."""
         answer = event.answer.content
-        if answer.elector not in self._nodes:
+        if answer.elector not in self._in_force.nodes:
             self.counters["answer_foreign"] += 1
         elif not self._numbers.is_possible(answer) or self._tells_unfit(answer):
             self.counters["answer_unfit"] += 1
@@ -470,7 +450,8 @@ class Agreement:
         if self._tells_unfit(answer):
             self.counters["answer_unfit"] += 1
             return
-        if isinstance(answer, Refused) and answer.elector in self._nodes and self._numbers.hear(answer, todo, now):
+        is_named = answer.elector in self._in_force.nodes
+        if isinstance(answer, Refused) and is_named and self._numbers.hear(answer, todo, now):
             self._count_anew(todo)
         register = self.registers.get(answer.task)
         if register is None or answer.elector not in self.electors:
@@ -603,7 +584,7 @@ class Agreement:
         for task, _, epoch in beat.asked_to_leave:
             register = self.registers.get(task)
             if register is not None and epoch == register.value.epoch:
-                register.expect_release(now, now + hold_s(self._fleet.timing.lease_s))
+                register.expect_release(now, now + hold_s(self._in_force.timing.lease_s))
 
     # --- learners ----------------------------------------------------------------------------------------------------
 
@@ -612,7 +593,7 @@ class Agreement:
         learnt = event.learnt
         if learnt.node == self._me:
             return
-        if learnt.node not in self._nodes:
+        if learnt.node not in self._in_force.nodes:
             self.counters["learnt_foreign"] += 1
             return
         if event.is_answer:
@@ -669,7 +650,7 @@ class Agreement:
             return False
         self.apart.discard(beat.node)
         if self.strangers.must_ask(beat.node, now):
-            todo.add(do.AskLearnt(peer=beat.node, deadline_s=self._fleet.timing.ballot_s))
+            todo.add(do.AskLearnt(peer=beat.node, deadline_s=self._in_force.timing.ballot_s))
         return True
 
     def foreign_generation(self, beat: Beat) -> str:
@@ -820,7 +801,7 @@ class Agreement:
             peer, now, every_s=every_s, is_behind=is_behind, revision=of_fleet, learnt=self.fleet_revision
         )
         if may_ask:
-            todo.add(do.AskLearnt(peer=peer, deadline_s=self._fleet.timing.ballot_s))
+            todo.add(do.AskLearnt(peer=peer, deadline_s=self._in_force.timing.ballot_s))
 
     # --- proposers ---------------------------------------------------------------------------------------------------
 

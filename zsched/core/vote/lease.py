@@ -47,7 +47,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from zsched.core.values.beat import Beat, Grant
-from zsched.core.values.fleet import Fleet, lease_terms
+from zsched.core.values.fleet import lease_terms
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.quorum import majority
@@ -318,7 +319,7 @@ class Leases:
     """Both sides of every exclusive task at one node.
 
     Args:
-        fleet: the fleet file.
+        in_force: the fleet.
         me: this node.
         incarnation: of this daemon.
         standing: {task: the newest persisted value, or ``None``}; empty when this node is no elector.
@@ -326,7 +327,7 @@ class Leases:
         granted_s: how long a lease may last from this node's life before (0: as long as today's).
     """
 
-    fleet: Fleet
+    in_force: InForce
     me: NodeId
     incarnation: int
     standing: Mapping[TaskId, Allocation | None]
@@ -346,14 +347,17 @@ class Leases:
     _others: dict[NodeId, str] = field(default_factory=dict)
     """{node: its terms} of the nodes whose terms differ from ours."""
     _granters: dict[TaskId, Granter] = field(init=False)
-    _holders: dict[TaskId, Holder] = field(default_factory=dict)
+    _holders: dict[TaskId, Holder] = field(init=False)
     _releases: dict[TaskId, Grant] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.terms = lease_terms(self.fleet)
-        self.electors, self.lease_s = self.fleet.electors, self.fleet.timing.lease_s
+        # Nothing is released where a task goes: its worker may still be at work.
+        self._holders = self.in_force.by_task()
+        fleet = self.in_force.fleet
+        self.terms = lease_terms(fleet)
+        self.electors, self.lease_s = fleet.electors, fleet.timing.lease_s
         self._granters, self._grants = {}, bool(self.standing)
-        for task in self.fleet.tasks:
+        for task in fleet.tasks:
             value = self.standing.get(task.name)
             is_leased = task.exclusive or (value is not None and value.leased)
             if (is_leased or _is_first(value)) and task.name in self.standing:
@@ -374,7 +378,7 @@ class Leases:
     @property
     def over_at(self) -> float:
         """When every grant to, or by, an earlier life of this node is over."""
-        return self.now + hold_s(max(self.fleet.timing.lease_s, self.granted_s))
+        return self.now + hold_s(max(self.in_force.timing.lease_s, self.granted_s))
 
     @property
     def terms_told(self) -> str:
@@ -434,18 +438,17 @@ class Leases:
             if task not in self._granters and value is not None and value.leased:
                 self._watch(task, value.owner, math.inf if self.is_in_doubt else self.over_at)
 
-    def adopt(self, fleet: Fleet, standing: Mapping[TaskId, Allocation | None], now: float) -> None:
-        """Take the exclusive tasks from ``fleet``, with the same electors and length of leases.
+    def on_tasks(self, standing: Mapping[TaskId, Allocation | None], now: float) -> None:
+        """Another fleet is in force: grant leases of its exclusive tasks. Electors and the lease's length are the same.
 
         Args:
-            fleet: the fleet file.
-            standing: as at the start, by the tasks of ``fleet``.
+            standing: as at the start, by the tasks of the fleet.
             now: monotonic seconds. What an earlier time here may have granted of a task that comes is over in a lease,
                 the longest that may still run. By today's length two owners could meet: a lease is granted, made
                 shorter for the fleet, and its task removed and created again, all before that lease has ended.
         """
-        self.fleet, self.standing, self._grants = fleet, standing, bool(standing)
-        leased = {task.name for task in fleet.tasks if task.exclusive}
+        self.standing, self._grants = standing, bool(standing)
+        leased = {task.name for task in self.in_force.fleet.tasks if task.exclusive}
         leased |= {task for task, value in standing.items() if value is not None and value.leased}
         until = math.inf if self.is_in_doubt else now + hold_s(max(self.lease_s, self.granted_s, self.guard_lease_s))
         kept = leased | {task for task, value in standing.items() if _is_first(value)}  # it waits for the one before
@@ -456,9 +459,6 @@ class Leases:
                 self._watch(task, None if value is None else value.owner, until)
             elif task in leased:
                 self._granters[task].is_for_first = False
-        # Nothing is released: the worker of a task that goes may still be at work.
-        names = {task.name for task in fleet.tasks}
-        self._holders = {task: holder for task, holder in self._holders.items() if task in names}
         # Who asks for a task that has gone has let its granter go, too: each release would be in all beats for ever.
         self._releases = {task: release for task, release in self._releases.items() if task in leased}
 

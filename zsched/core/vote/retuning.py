@@ -20,6 +20,7 @@ from typing import Any
 
 from zsched.core.values.change import Retune
 from zsched.core.values.fleet import Fleet, TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, TaskId, Tuning
 from zsched.core.values.struct import Struct, field, replace
 
@@ -45,16 +46,21 @@ class Retuning(Struct):
     """What one node wants changed in agreed tunings."""
 
     me: NodeId
+    in_force: InForce
     _wishes: dict[TaskId, _Wish] = field(default_factory=dict)
-    _heard: set[NodeId] = field(default_factory=set)
+    _heard: dict[NodeId, None] = field(default_factory=dict)
     """The peers that are heard, or were until a moment ago."""
     _ahead: dict[NodeId, int] = field(default_factory=dict)
     """{peer: its fleet value's revision} of those that had a newer one when they were first heard, while we lack it."""
 
+    def __post_init__(self) -> None:
+        self._heard, self._ahead = self.in_force.by_node(), self.in_force.by_node()
+        self._wishes = self.in_force.by_task()
+
     def hear(self, peer: NodeId, revision: int, ours: int) -> None:
         """A peer's beat tells the revision of its fleet value; ``ours`` is this node's."""
         if peer not in self._heard:
-            self._heard.add(peer)
+            self._heard[peer] = None
             if revision > ours:
                 self._ahead[peer] = revision
         elif peer in self._ahead:
@@ -64,18 +70,14 @@ class Retuning(Struct):
 
     def on_gone(self, peer: NodeId) -> None:
         """A peer is gone: what it has when it is heard again may be old for all others."""
-        self._heard.discard(peer)
+        self._heard.pop(peer, None)
         self._ahead.pop(peer, None)
 
-    def adopt(self, old: Fleet, new: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
-        """Want what differs between two files; a task that was never agreed begins with the new file's tuning."""
+    def want(self, old: Fleet, values: Mapping[TaskId, Allocation], now: float) -> None:
+        """Want what differs from ``old``; a task that was never agreed begins with the tuning in force."""
         known = {task.name: task for task in old.tasks}
-        names = [node.name for node in new.nodes]
-        rank = names.index(self.me)
-        self._heard.intersection_update(names)
-        self._ahead = {peer: revision for peer, revision in self._ahead.items() if peer in names}
-        self._wishes = {task: wish for task, wish in self._wishes.items() if any(one.name == task for one in new.tasks)}
-        for task in new.tasks:
+        rank = list(self.in_force.nodes).index(self.me)
+        for task in self.in_force.fleet.tasks:
             value = values[task.name]
             changed = _changed(known.get(task.name, task), task)
             if changed and value.revision > 0 and not self._ahead:

@@ -17,7 +17,8 @@ from collections.abc import Mapping
 from zsched.core.instructions import PublishProposal, RecordStory
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
-from zsched.core.values.fleet import Fleet, Timing
+from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId
 from zsched.core.values.quorum import present_voters
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
@@ -34,8 +35,8 @@ def vote_time(timing: Timing) -> float:
 class Voting:
     """One task's voting at one robot. Times are monotonic seconds."""
 
-    def __init__(self, fleet: Fleet, me: NodeId) -> None:
-        self._me = me
+    def __init__(self, in_force: InForce, me: NodeId) -> None:
+        self._me, self._in_force = me, in_force
         self.proposals: dict[NodeId, tuple[Proposal, float]] = {}
         """Each robot's newest proposal and when it came."""
         self.called_at = -math.inf
@@ -49,23 +50,24 @@ class Voting:
         self.tally_at = -math.inf
         self.commit: MoveOwner | None = None
         """The change that this robot will or does propose to the register."""
-        self.commit_at = math.inf
+        self._won_at = math.inf
+        """When its vote was won; infinity once the change is handed out."""
         self._commit_rank = 0
         self.awaited_until = -math.inf
         """A vote on a move was won: until when its value should be learnt."""
-        self._timing = fleet.timing
-        self.adopt(fleet)
 
-    def adopt(self, fleet: Fleet) -> None:
-        """Take the robots of a vote from ``fleet``; what a robot proposed that left does not count. `pace` follows."""
-        self._voters = fleet.voters
-        self._vote_s = vote_time(fleet.timing)
-        self.proposals = {voter: known for voter, known in self.proposals.items() if voter in self._voters}
+    @property
+    def _voters(self) -> tuple[NodeId, ...]:
+        return self._in_force.voters
 
-    def pace(self, timing: Timing) -> None:
-        """The clocks of a vote have changed, also that of a commit which waits for those of a better rank."""
-        self.commit_at += (timing.stagger_s - self._timing.stagger_s) * self._commit_rank
-        self._timing = timing
+    @property
+    def _vote_s(self) -> float:
+        return vote_time(self._in_force.timing)
+
+    @property
+    def commit_at(self) -> float:
+        """When this robot proposes its change: it waits for those of a better rank."""
+        return self._won_at + self._in_force.timing.stagger_s * self._commit_rank
 
     def next_deadline(self) -> float:
         """When a commit is due or the open vote ends; infinity when neither."""
@@ -81,10 +83,6 @@ class Voting:
             self._first_call_at = now
         else:
             self.called_at, self._first_call_at = now, None
-
-    def count_with(self, voters: tuple[NodeId, ...]) -> None:
-        """These robots vote from now on."""
-        self._voters = voters
 
     def going_to(self, now: float) -> NodeId | None:
         """Where the task is about to go: by a commit or a vote that was won, else by this robot's open proposal.
@@ -149,7 +147,8 @@ class Voting:
             return None
         self.opened_at = None
         if counted.outcome is VoteOutcome.WON:
-            self.awaited_until = now + self._timing.ballot_s + self._timing.stagger_s
+            timing = self._in_force.timing
+            self.awaited_until = now + timing.ballot_s + timing.stagger_s
             self._schedule_commit(counted, allocation, fresh, now)
         return counted
 
@@ -161,7 +160,7 @@ class Voting:
             return
         self.commit = MoveOwner(base_revision=allocation.revision, owner=counted.winner, reason=fresh[self._me].reason)
         self._commit_rank = supporters.index(self._me)
-        self.commit_at = now + self._timing.stagger_s * self._commit_rank
+        self._won_at = now
 
     # --- the commit ----------------------------------------------------------------------------------------------
 
@@ -169,12 +168,12 @@ class Voting:
         """The change that is due now; it is handed out once."""
         if self.commit is None or now < self.commit_at:
             return None
-        self.commit_at = math.inf
+        self._won_at = math.inf
         return self.commit
 
     def end_commit(self) -> None:
         """Our change was committed, overtaken or given up: votes may be called again."""
-        self.commit, self.commit_at, self.awaited_until = None, math.inf, -math.inf
+        self.commit, self._won_at, self.awaited_until = None, math.inf, -math.inf
 
     def on_learnt(self) -> None:
         """A newer revision is known: drop proposals on older bases, and a commit that is not handed out yet."""
@@ -189,31 +188,13 @@ class Voting:
 class Votes:
     """All tasks' votes at one robot (on edges none is ever open)."""
 
-    def __init__(self, fleet: Fleet, me: NodeId) -> None:
+    def __init__(self, in_force: InForce, me: NodeId) -> None:
         self._me = me
-        self.tasks = {spec.name: Voting(fleet, me) for spec in fleet.tasks}
-
-    def adopt(self, fleet: Fleet) -> None:
-        """Take tasks and robots from ``fleet``: votes on tasks that stay go on."""
-        kept = dict(self.tasks)
-        self.tasks.clear()  # the rounds look into the same table
-        for spec in fleet.tasks:
-            voting = self.tasks[spec.name] = kept.get(spec.name) or Voting(fleet, self._me)
-            voting.adopt(fleet)
-
-    def pace(self, timing: Timing) -> None:
-        """The clocks of votes have changed."""
-        for voting in self.tasks.values():
-            voting.pace(timing)
+        self.tasks = in_force.by_task(lambda _name: Voting(in_force, me))
 
     def next_deadline(self) -> float:
         """When a commit is due or an open vote ends; infinity when neither."""
         return min((voting.next_deadline() for voting in self.tasks.values()), default=math.inf)
-
-    def count_with(self, voters: tuple[NodeId, ...]) -> None:
-        """These robots vote from now on."""
-        for voting in self.tasks.values():
-            voting.count_with(voters)
 
     @property
     def is_idle(self) -> bool:

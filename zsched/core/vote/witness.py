@@ -17,6 +17,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from zsched.core.values.beat import Beat
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import NodeId
 from zsched.core.values.quorum import majority
@@ -32,7 +33,7 @@ class Witness:
     Args:
         me: this node.
         electors: the configured electors.
-        nodes: all nodes of the fleet file.
+        in_force: the fleet, for its nodes.
         incarnation: of this daemon.
         votes: the state's count of promises and acceptances at the start.
         started_at: monotonic seconds.
@@ -41,7 +42,7 @@ class Witness:
 
     me: NodeId
     electors: tuple[NodeId, ...]
-    nodes: frozenset[NodeId]
+    in_force: InForce
     incarnation: int
     votes: int
     started_at: float
@@ -57,7 +58,7 @@ class Witness:
         """Whether enough of the others have been asked."""
         known = self._answered | {self.me}
         is_enough = len(known.intersection(self.electors)) >= majority(len(self.electors))
-        return is_enough and (known == self.nodes or now >= self.started_at + ASK_ALL_S)
+        return is_enough and (known == self.in_force.nodes.keys() or now >= self.started_at + ASK_ALL_S)
 
     def has_asked(self, peer: NodeId) -> bool:
         """Whether this node has asked a peer in this life, as an elector has to before it votes."""

@@ -187,11 +187,6 @@ class InputStream:
         slot = self._slots.get(epoch)
         return slot is not None and slot.outlet.take_returned()
 
-    @property
-    def has_way(self) -> bool:
-        """True when what comes goes to an owner, or waits for the one that is flipped to."""
-        return self._active is not None or self._next is not None
-
     def warm_up(self, epoch: int) -> int:
         """Send every kept value to a worker that has just become ready (again); answers how many."""
         with self._lock:

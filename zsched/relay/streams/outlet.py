@@ -21,7 +21,6 @@ import contextlib
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable
 from typing import Any, Final
 
 import zenoh
@@ -242,20 +241,12 @@ class Outlet:
         """The key that a sample goes on under (``""``: it does not fit)."""
         return self._rewriting.key(str(sample.key_expr)) or "" if self._rewriting.is_wild else self._to
 
-    def send_end(self, epoch: int, done: Callable[[], object] = lambda: None) -> None:
-        """Put the end marker behind the last sample of every key; ``best_effort`` blocks while the link is full.
-
-        ``done`` is called when it has been put, maybe in the queue's thread.
-        """
-
-        def put() -> None:
-            self._put_ends(epoch)
-            done()
-
+    def send_end(self, epoch: int) -> None:
+        """Put the end marker behind the last sample of every key; ``best_effort`` blocks while the link is full."""
         if self._queue is None:
-            put()
+            self._put_ends(epoch)
         else:
-            self._queue.then(put)
+            self._queue.then(lambda: self._put_ends(epoch))
 
     def replay(self, owed: list[LeftOpen]) -> int:
         """Send what an owner that died left open, behind a marker that says so; answers how many were dropped."""

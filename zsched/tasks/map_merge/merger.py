@@ -251,7 +251,7 @@ class Merger:
             return "malformed snapshot: extent"
         if len(areas) > MAX_ROBOTS or not all(0.0 <= area < math.inf for area in areas.values()):
             return "malformed snapshot: areas"
-        self._pairs.adopt(edges)
+        self._pairs.take_over(edges)
         self._areas = areas
         if reference is None and extent is None:
             return ""  # the predecessor never had a map

@@ -150,7 +150,7 @@ class PairBook:
             return "the maps have too few walls so far"
         return "its map waits for a search"
 
-    def adopt(self, alignments: Iterable[Alignment]) -> None:
+    def take_over(self, alignments: Iterable[Alignment]) -> None:
         """Take over the alignments that the previous owner had accepted; others of before count no more.
 
         They are searched again as its own would be: once a map has grown from what it is at the next `refresh`.

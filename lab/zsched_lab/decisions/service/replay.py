@@ -21,6 +21,7 @@ from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.scheduler.usage import book
 from zsched.core.values.fleet import TaskSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Tuning
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerLoad, WorkerState
 from zsched_lab.decisions.replay import TICKS, rounds
@@ -76,7 +77,7 @@ class Scene:
             for spec, work in zip(history.fleet.tasks, history.works, strict=True)
         )
         self.fleet = replace(history.fleet, timing=timing, tasks=specs)
-        self.gateway = Gateway(self.fleet)
+        self.gateway = Gateway(InForce(self.fleet))
         self.values = {
             spec.name: Allocation(task=spec.name, revision=0, epoch=0, owner=None, tuning=spec.tuning) for spec in specs
         }

@@ -380,7 +380,7 @@ def test_a_worker_that_gets_its_command_is_started_though_somebody_else_s_was_re
         supervisor.start("merge")
         supervisor.mark_ready("merge", 0)
         wait_until(lambda: supervisor.states()["merge"] is WorkerState.READY)
-        supervisor.adopt({"merge": python(SLEEP)})
+        supervisor.keep({"merge": python(SLEEP)})
         recorder.wait("started")
         supervisor.mark_gone("merge", 0)
         wait_until(lambda: supervisor.states()["merge"] is WorkerState.STARTING)
@@ -396,7 +396,7 @@ def test_a_worker_that_loses_its_command_is_stopped_by_all_signals_and_another_o
         output = supervisor.output("merge")
         assert output is not None
         wait_until(lambda: bool(output.behind(0)[0]))
-        supervisor.adopt({"merge": WorkerSpec(stop_grace_s=0.2)})
+        supervisor.keep({"merge": WorkerSpec(stop_grace_s=0.2)})
         supervisor.mark_gone("merge", 0)
         supervisor.mark_ready("merge", 0)
         assert recorder.wait("exited")[-1] == "stopped by SIGKILL"
@@ -587,14 +587,14 @@ def test_a_changed_command_waits_for_the_order_and_then_runs() -> None:
     with supervised(python(SLEEP)) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("started")
-        supervisor.adopt({"merge": python(f"{SLEEP} # another")})
+        supervisor.keep({"merge": python(f"{SLEEP} # another")})
         assert recorder.wait("compared") == ("compared", "merge", True)
         assert [call for call in recorder.calls if call[0] == "exited"] == [], "nobody has asked for an end"
         supervisor.renew("merge")
         recorder.wait("started", 2)
         assert recorder.wait("compared", 2) == ("compared", "merge", False)
-        supervisor.adopt({"merge": python(f"{SLEEP} # another", start_deadline_s=50.0)})
-        supervisor.adopt({"merge": python(f"{SLEEP} # a third")})
+        supervisor.keep({"merge": python(f"{SLEEP} # another", start_deadline_s=50.0)})
+        supervisor.keep({"merge": python(f"{SLEEP} # a third")})
         assert recorder.wait("compared", 3) == ("compared", "merge", True), "a deadline alone makes nothing old"
 
 
@@ -605,17 +605,17 @@ def test_a_fleet_that_grows_makes_no_worker_old() -> None:
         supervisor.start("merge")
         recorder.wait("started")
         made["ZENOH_RUNTIME"] = "many"
-        supervisor.adopt({"merge": python(SLEEP)})
-        supervisor.adopt({"merge": python(SLEEP), "other": python(SLEEP)})
+        supervisor.keep({"merge": python(SLEEP)})
+        supervisor.keep({"merge": python(SLEEP), "other": python(SLEEP)})
         supervisor.start("other")
         recorder.wait("started", 2)
         assert [call for call in recorder.calls if call[0] == "compared"] == []
-        supervisor.adopt({"merge": python(SLEEP, env=(("ZENOH_RUNTIME", "an operator's own"),))})
+        supervisor.keep({"merge": python(SLEEP, env=(("ZENOH_RUNTIME", "an operator's own"),))})
         assert recorder.wait("compared") == ("compared", "merge", True), "what the file names is a change"
-        supervisor.adopt({"merge": python(SLEEP)})
+        supervisor.keep({"merge": python(SLEEP)})
         assert recorder.wait("compared", 2) == ("compared", "merge", False)
         made["ZSCHED_OUTPUT_KEYS"] = "{1}"
-        supervisor.adopt({"merge": python(SLEEP)})
+        supervisor.keep({"merge": python(SLEEP)})
         assert recorder.wait("compared", 3) == ("compared", "merge", True)
 
 
@@ -623,7 +623,7 @@ def test_workers_come_and_go_with_the_file() -> None:
     with supervised(python(SLEEP)) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("started")
-        supervisor.adopt({"other": python(SLEEP)})
+        supervisor.keep({"other": python(SLEEP)})
         supervisor.start("other")
         assert recorder.wait("started", 2)[1] == "other"
         assert "merge" in supervisor.pids(), "it works until it is told to stop"
@@ -639,7 +639,7 @@ def test_a_mended_command_is_tried_although_the_one_before_has_failed_for_good()
     with supervised(python("raise SystemExit(78)")) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("failed")
-        supervisor.adopt({"merge": python(SLEEP)})
+        supervisor.keep({"merge": python(SLEEP)})
         recorder.wait("started", 2)
 
 
@@ -650,10 +650,10 @@ def test_mended_variables_are_tried_although_the_worker_has_failed_for_good_with
     with supervised(python(code), made=made) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("failed")
-        supervisor.adopt({"merge": python(code), "other": python(code)})
+        supervisor.keep({"merge": python(code), "other": python(code)})
         wait_until(lambda: len(supervisor.states()) == 2)
         made["ZSCHED_OUTPUT_KEYS"] = "right"
-        supervisor.adopt({"merge": python(code)})
+        supervisor.keep({"merge": python(code)})
         recorder.wait("started", 2, timeout_s=10.0)
         assert len([call for call in recorder.calls if call[0] == "reset"]) == 1, "the same recipe is no reason"
 
@@ -662,7 +662,7 @@ def test_a_failed_worker_whose_command_goes_is_not_started_without_one() -> None
     with supervised(python("raise SystemExit(78)")) as (supervisor, recorder):
         supervisor.start("merge")
         recorder.wait("failed")
-        supervisor.adopt({"merge": WorkerSpec()})
+        supervisor.keep({"merge": WorkerSpec()})
         recorder.wait("reset")
         wait_until(lambda: supervisor.states() == {"merge": WorkerState.STOPPED})
         assert len([call for call in recorder.calls if call[0] == "started"]) == 1
@@ -674,11 +674,11 @@ def test_a_worker_that_is_wanted_before_it_is_known_starts_with_the_file() -> No
         for task in ("early", "stopped"):
             supervisor.start(task)
         supervisor.stop("stopped")
-        supervisor.adopt({task: python(SLEEP) for task in ("early", "merge", "stopped")})
+        supervisor.keep({task: python(SLEEP) for task in ("early", "merge", "stopped")})
         assert recorder.wait("started")[1] == "early"
         wait_until(lambda: len(supervisor.states()) == 3)
         supervisor.stop("early")
         recorder.wait("exited")
-        supervisor.adopt({task: python(SLEEP) for task in ("early", "merge", "stopped")})
+        supervisor.keep({task: python(SLEEP) for task in ("early", "merge", "stopped")})
         supervisor.start("stopped")
         assert recorder.wait("started", 2)[1] == "stopped", "once told, the wish is not kept"

@@ -10,7 +10,7 @@ import pytest
 
 from support.fleets import fleet_of, task_of
 from support.states import state_of
-from support.todos import agreed
+from support.todos import agreed, under
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate import orders
@@ -24,6 +24,7 @@ from zsched.core.values.change import RoundOutcome, told_end
 from zsched.core.values.document import Document, Flag, FlagKind, Rollout, Text
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -62,7 +63,7 @@ def make(
     held = None if value is None else RegisterState(task=FLEET.name, learnt=value)
     state = state_of("robot1", hardware="h", disk="d1", fleet_register=held)
     agreement = Agreement(
-        fleet=FLEET,
+        in_force=InForce(FLEET),
         me="robot1",
         durable=state,
         incarnation=7,
@@ -160,7 +161,9 @@ def test_a_promise_of_the_first_change_is_on_disk_before_its_answer_and_after_a_
     assert state is not None
     assert state.fleet_register is not None
     assert state.fleet_register.promised == BALLOT
-    again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=200.0)
+    again = Agreement(
+        in_force=InForce(FLEET), me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=200.0
+    )
     for name in NAMES:
         again.witness.on_answer(Learnt(node=name, values=()))
     _, answer = asked(again, prepare_of(replace(BALLOT, counter=4)))
@@ -308,7 +311,7 @@ def test_a_learnt_value_is_followed_once_its_document_is_stored_and_asked_for_un
 
 def test_a_node_that_has_come_by_the_file_is_asked_for_documents_too() -> None:
     agreement = make()
-    agreement.adopt(fleet_of(TASK, of=(*NAMES, "robot4"), electors=ROBOTS), ToDo(), 100.0)
+    under(agreement, fleet_of(TASK, of=(*NAMES, "robot4"), electors=ROBOTS), 100.0)
     told = Learnt(node="robot3", values=(), fleet=ADOPT.apply(FIRST))
     todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=True), 100.1)
     assert [one.peers for one in of(todo, do.FetchDocument)] == [("robot3", "robot2", "edge1", "robot4")]
@@ -319,7 +322,9 @@ def test_an_elector_that_starts_again_asks_what_became_of_a_value_that_it_has_ac
     asked(agreement, prepare_of())
     asked(agreement, accept_of(ADOPTED))
     state = agreement.to_persist(100.2)
-    again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=200.0)
+    again = Agreement(
+        in_force=InForce(FLEET), me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=200.0
+    )
     todo = agreed(again.tick, 200.0 + SETTLE_AFTER_START_S)
     assert [type(one.question) for one in of(todo, do.AskElectors)] == [Prepare]
 

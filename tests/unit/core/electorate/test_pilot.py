@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.fleet_values import fleet_value_of
-from zsched.core.electorate.changes import AddElector, RemoveElector, SetAway
+from zsched.core.electorate.changes import AddElector, FleetChange, RemoveElector, SetAway
 from zsched.core.electorate.pilot import PAUSE_SHARE, STEADY, TARGET, Course, Pilot, Word, may_go
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.model import NodeKind
@@ -43,7 +43,8 @@ class Ear:
 
     def __init__(self, fleet: FleetValue, course: Course = COURSE) -> None:
         self.now, self.value, self.course = 0.0, fleet, course
-        self.pilot = Pilot(me="a", disk=disk_of("a"), stagger_s=1.0, now=0.0)
+        self.pilot = Pilot(me="a", disk=disk_of("a"), now=0.0)
+        self.stagger_s = 1.0
 
     def hear(self, names: str, seconds: float, **words: object) -> None:
         """For so long these names beat; all of them say the same."""
@@ -53,6 +54,9 @@ class Ear:
             for name in names:
                 self.say(name, **words)
             self.pilot.gone(self.value, self.course, self.now)
+
+    def tick(self, now: float, *, is_busy: bool) -> FleetChange | None:
+        return self.pilot.tick(self.value, self.course, now, stagger_s=self.stagger_s, is_busy=is_busy)
 
     def say(self, name: str, **words: object) -> None:
         word = Word(node=name, disk=disk_of(name), is_current=True)
@@ -453,11 +457,7 @@ def test_electors_take_turns_and_a_change_that_was_lost_is_proposed_again() -> N
     for revision in (7, 8, 9):
         ear = Ear(value("abc", revision=revision), replace(COURSE, leaving=("c",)))
         ear.hear("bc", 2.0)
-        asked_at = [
-            step * 0.1
-            for step in range(100)
-            if ear.pilot.tick(ear.value, ear.course, ear.now + step * 0.1, is_busy=False) is not None
-        ]
+        asked_at = [step * 0.1 for step in range(100) if ear.tick(ear.now + step * 0.1, is_busy=False) is not None]
         waits.append(round(asked_at[0]))
         assert asked_at[1] - asked_at[0] == pytest.approx(4.0), "all others have had their turn"
     assert sorted(waits) == [0, 1, 2]
@@ -467,11 +467,11 @@ def test_electors_take_turns_and_a_change_that_was_lost_is_proposed_again() -> N
 def test_who_has_a_later_turn_adds_an_elector_in_its_turn(revision: int, rank: int) -> None:
     """The advice tells for how long the candidate was heard: its words change every second, and it is the same."""
     ear = Ear(value("abc", revision=revision))
-    ear.pilot.stagger_s = 2.0
+    ear.stagger_s = 2.0
     proposed = None
     while proposed is None and ear.now < 10 * STEADY * T:
         ear.hear("bcxy", 1.0)
-        proposed = ear.pilot.tick(ear.value, ear.course, ear.now, is_busy=False)
+        proposed = ear.tick(ear.now, is_busy=False)
     assert ear.now == 1.0 + STEADY * T + 2.0 * rank
     assert isinstance(proposed, AddElector)
     assert proposed.reason == f"x becomes an elector: heard without a break for {STEADY * T + 2.0 * rank:.0f} s"
@@ -483,16 +483,16 @@ def test_another_change_waits_for_its_turn_anew() -> None:
     turns = []
     for course in (COURSE, replace(COURSE, leaving=("c",))):
         ear.course = course
-        turns.append([ear.pilot.tick(ear.value, course, ear.now + step / 2, is_busy=False) for step in range(4)])
+        turns.append([ear.tick(ear.now + step / 2, is_busy=False) for step in range(4)])
         ear.now += 2.0
     assert turns == [[None] * 4] * 2, "two turns of others come before it"
-    assert isinstance(ear.pilot.tick(ear.value, ear.course, ear.now, is_busy=False), RemoveElector)
+    assert isinstance(ear.tick(ear.now, is_busy=False), RemoveElector)
 
 
 def test_nothing_is_proposed_while_a_change_is_under_way() -> None:
     ear = Ear(value("abc", revision=9), replace(COURSE, leaving=("c",)))
     ear.hear("bc", 2.0)
-    assert all(ear.pilot.tick(ear.value, ear.course, ear.now + n / 10, is_busy=True) is None for n in range(50))
+    assert all(ear.tick(ear.now + n / 10, is_busy=True) is None for n in range(50))
     assert ear.pilot.advice.reason == "c is removed as an elector: it leaves"
 
 

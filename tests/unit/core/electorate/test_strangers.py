@@ -26,6 +26,7 @@ from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Learnt, Prepare
 from zsched.core.values.model import Acceptance, Allocation, Ballot, PeerState, Proposal, RegisterState
 from zsched.core.vote.agreement import Agreement
@@ -214,7 +215,7 @@ def test_a_stranger_is_no_peer_and_its_other_frames_do_not_count() -> None:
 
 
 def test_one_forged_beat_makes_no_stranger_of_a_peer() -> None:
-    one = Strangers(fleet=FLEET.name, silence_s=1.2)
+    one = Strangers(in_force=InForce(replace(FLEET, timing=replace(FLEET.timing, suspect_s=1.2))))
     assert not one.hear(beat(LEFT), LEFT.generation_id, is_named=True, now=100.0)
     assert one.hear(beat(RIGHT), LEFT.generation_id, is_named=True, now=100.1)
     assert not one.is_one("robot3", 100.2)
@@ -223,7 +224,7 @@ def test_one_forged_beat_makes_no_stranger_of_a_peer() -> None:
 
 def test_forged_generations_do_not_fill_the_memory() -> None:
     """Of those that come when it is full nothing is remembered: they are asked about again."""
-    one = Strangers(fleet=FLEET.name, silence_s=1.2)
+    one = Strangers(in_force=InForce(replace(FLEET, timing=replace(FLEET.timing, suspect_s=1.2))))
     for number in range(KEPT + 1):
         value = replace(RIGHT, generation_id=f"{number:032x}"[::-1])
         assert one.on_learnt(Learnt(node="robot3", values=(), fleet=value), LEFT, is_named=True)
@@ -249,7 +250,7 @@ def test_a_grant_needs_the_same_generation_as_well_as_the_same_number() -> None:
 def test_without_its_document_a_robot_counts_the_electors_that_are_agreed() -> None:
     one = node(stored={})
     one.start(100.0)
-    assert one.rounds.electors == LEFT.electorate.names != one.fleet.electors
+    assert one.in_force.electors == LEFT.electorate.names != one.fleet.electors
 
 
 def test_recover_at_once_grants_nothing_while_a_lease_of_before_may_last() -> None:

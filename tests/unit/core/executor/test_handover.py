@@ -651,7 +651,7 @@ def test_a_worker_that_was_told_to_stop_at_once_has_nothing_to_hear() -> None:
 
 def adopted(one: Executor, spec: TaskSpec) -> list[Instruction]:
     todo = ToDo()
-    one.adopt(spec, todo, 20.0, is_agreed_leased=False)
+    one.on_spec(spec, todo, 20.0, is_agreed_leased=False)
     return list(todo.apply)
 
 
@@ -702,5 +702,5 @@ def test_who_works_alone_does_so_while_its_file_lets_it(later: OnIsolation) -> N
     done(alone.execute, allocation_of(1, "edge1"), 0.0)
     done(alone.isolate, 0.5)
     assert alone.is_local
-    alone.adopt(replace(spec, on_isolation=later, drain_s=3.0), ToDo(), 1.0, is_agreed_leased=False)
+    alone.on_spec(replace(spec, on_isolation=later, drain_s=3.0), ToDo(), 1.0, is_agreed_leased=False)
     assert alone.is_local is (later is OnIsolation.LOCAL)

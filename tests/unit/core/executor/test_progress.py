@@ -22,6 +22,7 @@ from zsched.core.instructions import Instruction, RecordStory, RestartWorker
 from zsched.core.node import Node
 from zsched.core.scheduler.probation import LIMIT_S
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import RegisterState
 from zsched.core.values.plan import Direction, StreamCount
 from zsched.core.values.profile import Profile, TaskProgress, WorkerState
@@ -50,7 +51,7 @@ class Robot:
     """One robot's counters, told once a second."""
 
     def __init__(self, spec: TaskSpec = SPEC) -> None:
-        self.progress, self.executor = Progress([spec]), settled(spec)
+        self.progress, self.executor = Progress(InForce(fleet_of(spec))), settled(spec)
         self.taken = self.given = 0
         self.acknowledged: int | None = None
         self.now = 100.0
@@ -164,7 +165,7 @@ class Owner:
 
     def __init__(self, spec: TaskSpec = SPEC) -> None:
         self.fleet = fleet_of(spec, of=("edge1", *ROBOTS))
-        self.watch, self.gateway = HangWatch(self.fleet), Gateway(self.fleet)
+        self.watch, self.gateway = HangWatch(InForce(self.fleet)), Gateway(InForce(self.fleet))
         self.executor = settled(spec, has_streams=False)
         self.watch.note_worker("merge", WorkerState.READY, 100.0)
         self.sequence = 0
@@ -216,7 +217,7 @@ def test_a_complaint_counts_from_the_very_end_of_the_time_on() -> None:
 def test_a_robot_s_profile_tells_what_its_relay_has_counted_of_tasks_with_a_deadline() -> None:
     for worker, told in ((SPEC.worker, (UNSERVED,)), (WorkerSpec(command=("merge",)), ())):
         spec = replace(SPEC, worker=worker)
-        watch, executor = HangWatch(replace(Owner().fleet, tasks=(spec,))), settled(spec)
+        watch, executor = HangWatch(InForce(replace(Owner().fleet, tasks=(spec,)))), settled(spec)
         for second in range(10):
             counts = (
                 StreamCount(stream="merge/in/0", messages=10 * second),

@@ -9,10 +9,11 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import task_of, tuning_of
+from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rhythm import COUNT_S, HUNG_TIMES, LEAST_S, Progress
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.plan import Direction, ReadyWhen, StreamCount
 
 INPUT = StreamRule(direction=Direction.INPUT, from_template="{robot}/in", to_template="{target}/merge/{robot}/in")
@@ -29,7 +30,7 @@ class Robot:
     """One robot's counters, told once a second."""
 
     def __init__(self, spec: TaskSpec = FOREIGN, *, acknowledges: bool = False) -> None:
-        self.progress, self.acknowledges = Progress((spec,)), acknowledges
+        self.progress, self.acknowledges = Progress(InForce(fleet_of(spec))), acknowledges
         self.executor = Executor(spec=spec, me="robot1", has_streams=True)
         self.executor.phase, self.executor.epoch, self.executor.owner = Phase.SETTLED, 1, "edge1"
         self.taken = self.given = 0.0
@@ -194,6 +195,6 @@ def test_what_is_no_task_any_more_is_forgotten() -> None:
     robot = Robot()
     robot.run(20.0, out_hz=10.0)
     assert robot.run(10.0)
-    robot.progress.adopt(())
+    robot.progress._in_force.take(fleet_of(task_of("other")))
     assert robot.overdue_s is None
     assert math.isfinite(robot.now)

@@ -16,6 +16,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, fleet_hash, lease_terms
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation
 
@@ -35,7 +36,7 @@ NEW, OLD = fleet(EXCLUSIVE), fleet(OPEN)
 
 def sealing(of: Fleet = NEW, me: str = "e1") -> Sealing:
     executors = {task.name: Executor(spec=task, me=me, has_streams=False) for task in of.tasks}
-    return Sealing(fleet=of, me=me, executors=executors, over_at=YOUNG_S, terms=lambda: lease_terms(of))
+    return Sealing(in_force=InForce(of), me=me, executors=executors, over_at=YOUNG_S, terms=lambda: lease_terms(of))
 
 
 def value(task: str = "guard", *, leased: bool = False, owner: str | None = "e1", epoch: int = 3) -> Allocation:
@@ -98,8 +99,10 @@ def test_whoever_may_work_without_a_lease_is_waited_for_and_named(said: Learnt |
 def test_an_owner_waits_for_its_own_worker_too_which_nobody_else_knows_to_work_without_a_lease() -> None:
     executor = Executor(spec=OPEN, me="e1", has_streams=False)
     done(executor.execute, value(), 0.0)
-    one = Sealing(fleet=NEW, me="e1", executors={"guard": executor}, over_at=YOUNG_S, terms=lambda: lease_terms(NEW))
-    executor.adopt(EXCLUSIVE, ToDo(), 10.0, is_agreed_leased=False)
+    one = Sealing(
+        in_force=InForce(NEW), me="e1", executors={"guard": executor}, over_at=YOUNG_S, terms=lambda: lease_terms(NEW)
+    )
+    executor.on_spec(EXCLUSIVE, ToDo(), 10.0, is_agreed_leased=False)
     assert one.to_ask(values(), 10.0) == ("e2",), "nobody asks itself"
     one.on_answer(answer())
     assert one.due(values(), 10.0) == []

@@ -16,6 +16,7 @@ from zsched.core.executor.tenure import ALONE_AFTER_S, Tenure
 from zsched.core.membership.peers import Membership
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, OnIsolation
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import Leases
@@ -30,12 +31,12 @@ def tenure_of(me: NodeId, *, leased: bool = False, owner: str | None = "edge1", 
     (task,) = fleet.tasks
     executor = Executor(spec=task, me=me, has_streams=me.startswith("r"))
     done(executor.execute, replace(allocation_of(1, owner), leased=leased), 9.0)
-    leases = Leases(fleet=fleet, me=me, incarnation=1, standing={}, now=0.0)
-    return Tenure(fleet=fleet, me=me, leases=leases, executors={"merge": executor})
+    leases = Leases(in_force=InForce(fleet), me=me, incarnation=1, standing={}, now=0.0)
+    return Tenure(in_force=leases.in_force, me=me, leases=leases, executors={"merge": executor})
 
 
 def silence(fleet: Fleet = LOCAL, me: NodeId = "robot1") -> Membership:
-    return Membership(me, tuple(node.name for node in fleet.nodes), fleet.timing)
+    return Membership(me, InForce(fleet))
 
 
 def is_alone(tenure: Tenure) -> bool:
@@ -88,9 +89,11 @@ def test_who_may_not_work_alone_waits_for_nothing(me: NodeId, leased: bool, owne
 def test_what_was_counted_before_the_file_forbade_it_does_not_count_when_it_allows_it_again() -> None:
     tenure, membership = tenure_of("robot1"), silence()
     tenure.tend_isolation(membership, ToDo(), 10.0)
-    for fleet in (HOLD, LOCAL):
-        tenure.adopt(fleet)
-        assert tenure.next_deadline(10.1) == math.inf
+    tenure.in_force.take(HOLD)
+    tenure.tend_isolation(membership, ToDo(), 10.05)
+    assert tenure.next_deadline(10.1) == math.inf
+    tenure.in_force.take(LOCAL)
+    assert tenure.next_deadline(10.1) == math.inf
     tenure.tend_isolation(membership, ToDo(), 20.0)
     assert tenure.next_deadline(20.0) == 20.0 + ALONE_AFTER_S
     tenure.tend_isolation(membership, ToDo(), 20.0 + ALONE_AFTER_S - 0.001)

@@ -126,7 +126,7 @@ def test_a_worker_that_should_be_started_again_and_starts_is_not_told_of() -> No
 def test_a_worker_that_is_kept_no_more_is_told_of_until_it_has_stopped() -> None:
     workers = Workers.of(fleet_of(task_of()), "edge1")
     workers.on_changed(changed(WorkerState.READY))
-    workers.adopt(fleet_of(tasks=()), "edge1", {"merge"})
+    workers.on_fleet(fleet_of(tasks=()), "edge1", {"merge"})
     workers.on_changed(changed(WorkerState.STARTING, "pid 7"))
     assert (workers.states, said(workers, 0.0)) == ({"merge": WorkerState.STARTING}, {"merge": "pid 7"})
     workers.on_changed(changed(WorkerState.STOPPED, "signal 15"))
@@ -136,7 +136,7 @@ def test_a_worker_that_is_kept_no_more_is_told_of_until_it_has_stopped() -> None
 def test_a_worker_that_is_kept_no_more_and_waits_for_its_next_start_is_told_of_until_nobody_starts_it() -> None:
     workers = Workers.of(fleet_of(task_of()), "edge1")
     workers.on_changed(changed(WorkerState.STOPPED, "restarting (failure 1 of 3): exited with status 1"))
-    workers.adopt(fleet_of(tasks=()), "edge1", {"merge"})
+    workers.on_fleet(fleet_of(tasks=()), "edge1", {"merge"})
     assert list(workers.states) == ["merge"]
     assert workers.on_changed(changed(WorkerState.STOPPED, "stopped before its next start")) is None
     assert (workers.states, said(workers, 0.0)) == ({}, {})
@@ -148,7 +148,7 @@ def test_somebody_else_s_worker_that_is_kept_no_more_is_told_of_until_it_has_end
     workers = Workers.of(fleet_of(foreign), "edge1")
     workers.on_changed(changed(WorkerState.READY))
     workers.on_outdated(ev.WorkerOutdated(task="merge", reason="its file has changed"))
-    workers.adopt(fleet_of(replace(foreign, candidates=("edge2",))), "edge1", {"merge"})
+    workers.on_fleet(fleet_of(replace(foreign, candidates=("edge2",))), "edge1", {"merge"})
     workers.let_go({"merge"})
     assert workers.states == {"merge": WorkerState.READY}
     assert workers.has_unwatched
@@ -160,6 +160,6 @@ def test_a_worker_of_ours_that_is_kept_no_more_is_told_of_until_its_process_has_
     ours = task_of(worker=WorkerSpec(command=("merge",)))
     workers = Workers.of(fleet_of(ours), "edge1")
     workers.on_changed(changed(WorkerState.READY))
-    workers.adopt(fleet_of(replace(ours, candidates=("edge2",))), "edge1", {"merge"})
+    workers.on_fleet(fleet_of(replace(ours, candidates=("edge2",))), "edge1", {"merge"})
     workers.let_go(set())
     assert workers.states == {"merge": WorkerState.READY}

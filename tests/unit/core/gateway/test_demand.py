@@ -15,6 +15,7 @@ from zsched.core.gateway.demand import SETTLE_S, UNSURE, Amount, Demands, Need
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.job_need import crowd
 from zsched.core.values.fleet import Demand
+from zsched.core.values.in_force import InForce
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
@@ -431,7 +432,7 @@ def test_a_changed_program_is_not_held_to_what_the_one_before_needed(*, is_moved
     fleet = fleet_of(TASK, of=("edge1", "edge2", "robot1"), electors=("robot1",))
     before = profile(2.0, 600.0, cpu=3.0)
     light = profile(0.5, 200.0, node="edge2" if is_moved else "edge1", cpu=4.0, wanted=3.0)
-    gateway = Gateway(fleet)
+    gateway = Gateway(InForce(fleet))
     due = replace(before, workers=tuple(replace(load, renewal=Renewal.DUE) for load in before.workers))
     starting = replace(before, workers=(load_of(state=WorkerState.STARTING),))
     for number, one in enumerate((before, before, due, due, starting, light)):

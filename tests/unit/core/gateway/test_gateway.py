@@ -10,6 +10,7 @@ from support.profiles import load_of, profile_of
 from zsched.core.gateway.demand import Amount
 from zsched.core.gateway.gateway import EdgeData, Gateway
 from zsched.core.values.fleet import Demand
+from zsched.core.values.in_force import InForce
 from zsched.core.values.profile import Jobs, Profile, WorkerState
 
 TASK = task_of(demand=Demand(cpu_cores=0.4, memory_mb=250.0))
@@ -36,7 +37,7 @@ def profile(
 
 
 def gateway_with(*profiles: Profile, now: float = 0.0) -> Gateway:
-    gateway = Gateway(FLEET)
+    gateway = Gateway(InForce(FLEET))
     for one in profiles:
         assert gateway.absorb(one, now) is None
     return gateway
@@ -71,8 +72,8 @@ def test_a_battery_is_remembered_for_its_node_s_life_and_for_as_long_as_the_node
         one = replace(profile(sequence), gauges=gauges)
         assert gateway.absorb(one, float(sequence)) is None
         assert gateway.readings(one) == known
-    gateway.adopt(fleet_of(TASK, of=("edge2", "robot1"), electors=("robot1",)))
-    gateway.adopt(FLEET)
+    gateway._in_force.take(fleet_of(TASK, of=("edge2", "robot1"), electors=("robot1",)))
+    gateway._in_force.take(FLEET)
     assert gateway.readings(profile(5)) == {}
     assert gateway.absorb(profile(6), 20.0) is None
     assert gateway.readings(profile(6)) == {}
@@ -129,7 +130,7 @@ def test_a_stale_repeat_does_not_make_the_profile_younger() -> None:
 
 
 def test_a_node_that_is_not_in_the_fleet_file_is_foreign() -> None:
-    gateway = Gateway(FLEET)
+    gateway = Gateway(InForce(FLEET))
 
     assert gateway.absorb(profile(node="edge9"), 0.0) == "foreign"
     assert gateway.newest("edge9", 0.0) is None
@@ -162,7 +163,7 @@ def test_an_owner_without_a_fresh_profile_or_worker_is_not_learnt_from() -> None
 def test_a_quicker_machine_that_is_gone_does_not_set_the_need(*, is_gone: bool) -> None:
     """Jobs that also wait for a disk, on a slow core: it needs what the quickest machine that is there would do."""
     task = task_of(candidates=("edge1", "edge2"))
-    gateway = Gateway(fleet_of(task, of=("edge1", "edge2", "robot1"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(task, of=("edge1", "edge2", "robot1"), electors=("robot1",))))
     quick = profile_of("edge2", speed=4.0)
     jobs = Jobs(time_s=0.2, cpu_s=0.15, wait_s=0.0, done_hz=5.0, wanted_hz=10.0)
     load = load_of(cpu_cores=0.75, runnable=0.75, jobs=jobs)
@@ -187,7 +188,7 @@ def test_profiles_are_fresh_together_until_the_first_of_them_is_not() -> None:
 
 def test_a_changed_fleet_keeps_the_profiles_of_the_nodes_that_stay() -> None:
     gateway = gateway_with(profile(5), profile(5, node="edge2"))
-    gateway.adopt(fleet_of(task_of(candidates=("edge1",)), of=("edge1", "robot1"), electors=("robot1",)))
+    gateway._in_force.take(fleet_of(task_of(candidates=("edge1",)), of=("edge1", "robot1"), electors=("robot1",)))
     assert gateway.fresh("edge1", 1.0) == profile(5)
     assert gateway.absorb(profile(4), 1.0) == "stale"
     assert gateway.newest("edge2", 1.0) is None

@@ -17,7 +17,7 @@ from support.states import state_of
 from support.storm import ELECTORATE, FLEET, ROBOTS, Storm, some_fleet
 from zsched.core import events as ev
 from zsched.core import instructions as do
-from zsched.core.handlers.fleet import adopt as take_over
+from zsched.core.handlers.fleet import go_by as take_over
 from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.todo import ToDo

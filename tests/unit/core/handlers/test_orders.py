@@ -22,7 +22,7 @@ from zsched.core.node import Node
 from zsched.core.status import build_snapshot
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.document import Flag, FlagKind
-from zsched.core.values.fleet import Fleet, WorkerSpec, electorate_hash
+from zsched.core.values.fleet import Fleet, Timing, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     CommandOutcome,
     CommandResult,
@@ -262,7 +262,7 @@ def test_an_end_that_is_under_way_is_not_proposed_once_more(monkeypatch: pytest.
     lone = Lone()
     lone.hold(Hold.PAUSE, for_s=60.0)
     register = lone.node.registers["merge"]
-    monkeypatch.setattr(register, "_ballot_s", 3.0)
+    monkeypatch.setattr(register, "_clocks", lambda: Timing(ballot_s=3.0))
     monkeypatch.setattr(lone, "_carry", lambda _batch: None)
     lone.wait(60.0 + 2.5 * AGAIN_S)
     assert [one.reason for one in register.wanted] == ["the time of its pause is over"]
@@ -370,7 +370,7 @@ def test_what_was_voted_for_a_node_before_its_flag_was_known_is_not_proposed() -
         lone = Lone()
         voting = lone.node.votes.tasks["merge"]
         base = lone.node.registers["merge"].value.revision
-        voting.commit, voting.commit_at = MoveOwner(base_revision=base, owner="edge2", reason="better"), lone.now
+        voting.commit, voting._won_at = MoveOwner(base_revision=base, owner="edge2", reason="better"), lone.now
         lone.node.flags.take(flags, lone.now)
         lone.tell(ev.DeadlineReached())
         assert lone.node.registers["merge"].value.owner == owner

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from support.beats import beat_of
+from support.fleets import fleet_of
 from zsched.core.membership.identity import QUIET_S
 from zsched.core.membership.namesakes import BESIDE_BEATS, BESIDE_S, LIVES_KEPT, TWINS_TOLD, WHERE_EVERY_S, Namesakes
 from zsched.core.values.beat import Beat
+from zsched.core.values.in_force import InForce
 
 BEAT_S = 0.2
+
+
+def here(beat_s: float) -> InForce:
+    fleet = fleet_of()
+    return InForce(replace(fleet, timing=replace(fleet.timing, beat_s=beat_s, suspect_s=beat_s)))
 
 
 def beat(incarnation: int, sequence: int, node: str = "edge2") -> Beat:
@@ -15,7 +24,7 @@ def beat(incarnation: int, sequence: int, node: str = "edge2") -> Beat:
 
 
 def two(*, tokens: tuple[int, ...] = (7, 8), node: str = "edge2") -> Namesakes:
-    namesakes = Namesakes(BEAT_S)
+    namesakes = Namesakes(here(BEAT_S))
     for incarnation in tokens:
         namesakes.on_token(node, incarnation, is_present=True)
     return namesakes
@@ -46,7 +55,7 @@ def test_two_daemons_that_beat_beside_each_other_are_told_once_and_named() -> No
 
 
 def test_slow_beats_take_so_many_of_them() -> None:
-    namesakes = Namesakes(1.0)
+    namesakes = Namesakes(here(1.0))
     for incarnation in (7, 8):
         namesakes.on_token("edge2", incarnation, is_present=True)
     news = [

@@ -7,10 +7,14 @@ from dataclasses import replace
 import pytest
 
 from support.beats import beat_of
+from support.fleets import fleet_of
 from zsched.config.timing import PROFILES, WIFI
 from zsched.core.membership.pace import FULL_S, Pace
 from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
+
+HERE = InForce(replace(fleet_of(), timing=WIFI))
 
 
 def sent(pace: Pace, number: int, now: float, *, is_restless: bool = False, suspects: tuple[str, ...] = ()) -> Beat:
@@ -19,7 +23,7 @@ def sent(pace: Pace, number: int, now: float, *, is_restless: bool = False, susp
 
 def calm() -> Pace:
     """Of a node that has sent a calm beat at time 100, with calm peers."""
-    pace = Pace(timing=WIFI)
+    pace = Pace(in_force=HERE)
     sent(pace, 1, 100.0 - FULL_S)
     assert pace.next_at(sent(pace, 2, 100.0), are_all_calm=True) == pytest.approx(100.4)
     return pace
@@ -35,7 +39,7 @@ def test_a_fleet_with_no_room_between_its_times_has_one_pace() -> None:
 
 
 def test_a_node_is_calm_once_its_beats_have_said_the_same_for_long_enough() -> None:
-    pace = Pace(timing=WIFI)
+    pace = Pace(in_force=HERE)
     assert not sent(pace, 1, 100.0).calm
     assert not sent(pace, 2, 100.0 + FULL_S - 0.1).calm
     assert sent(pace, 3, 100.0 + FULL_S).calm
@@ -65,6 +69,6 @@ def test_what_happens_brings_the_next_beat_to_where_full_pace_would_have_it(at: 
 
 
 def test_at_full_pace_nothing_is_brought_forward() -> None:
-    pace = Pace(timing=WIFI)
+    pace = Pace(in_force=HERE)
     pace.next_at(sent(pace, 1, 100.0), are_all_calm=True)
     assert pace.hasten(100.2, 100.1) == 100.2

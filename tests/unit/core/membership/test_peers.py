@@ -10,9 +10,11 @@ from random import Random
 import pytest
 
 from support.beats import beat_of
+from support.fleets import fleet_of
 from zsched.config.timing import WAN, WIFI, WIRED
 from zsched.core.membership.peers import LOSS_FACTOR, LOSSY_S, MAX_LAG_FACTOR, NEW_TIMES, Membership
 from zsched.core.values.fleet import Timing
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, PeerState
 
 SMALL = ("me", "a", "b")
@@ -24,7 +26,7 @@ class Ear:
     """A membership and the peers that beat into it."""
 
     def __init__(self, nodes: tuple[NodeId, ...], timing: Timing = WIFI) -> None:
-        self.members = Membership("me", nodes, timing)
+        self.members = Membership("me", InForce(replace(fleet_of(of=nodes, electors=nodes), timing=timing)))
         self.timing = timing
         self.sequence = 0
 

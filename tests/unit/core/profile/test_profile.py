@@ -532,7 +532,7 @@ def test_a_mean_goes_on_by_another_time_constant_from_where_it_is(smoothing_s: f
     profiler = make_profiler()
     timing = replace(TIMING, smoothing_s=smoothing_s, sample_s=0.5)
     gauges_of(profiler, 100.0, ("gpu", 0.0))
-    profiler.adopt(timing)
+    profiler.retune(timing)
     found = gauges_of(profiler, 100.0 + GAUGE_SMOOTHING_S, ("gpu", 1.0))
     lag = GAUGE_SMOOTHING_S / max(smoothing_s, GAUGE_SMOOTHING_S)
     assert found["gpu"] == pytest.approx(1 - math.exp(-lag), abs=1e-3)
@@ -544,7 +544,7 @@ def test_a_worker_does_not_look_like_other_load_after_another_time_constant(smoo
     profiler = make_profiler()
     for step in range(50):
         profiler.absorb(device(2.0, 1000.0, load(1.5, 400.0)), (), 100.0 + 0.2 * step)
-    profiler.adopt(replace(TIMING, smoothing_s=smoothing_s))
+    profiler.retune(replace(TIMING, smoothing_s=smoothing_s))
     profiler.absorb(device(2.0, 1000.0, load(1.5, 400.0)), (), 110.0)
     profile = taken(profiler, 110.0)
     (worker,) = profile.workers
@@ -556,7 +556,7 @@ def test_what_a_worker_tells_of_its_jobs_stands_with_another_time_constant() -> 
     profiler = make_profiler()
     for step in range(60):
         if step == 50:
-            profiler.adopt(replace(TIMING, smoothing_s=4.0))
+            profiler.retune(replace(TIMING, smoothing_s=4.0))
         now, done = 0.2 * step, step
         word = WorkerJobs(task="merge", incarnation="1", at_s=now, done=done, time_s=0.05 * done)
         assert profiler.note_jobs(word, now)
@@ -587,7 +587,7 @@ def test_of_somebody_else_s_worker_its_jobs_are_told_and_their_use() -> None:
 def test_the_signal_of_a_link_goes_on_by_another_time_constant() -> None:
     profiler = make_profiler()
     profiler.absorb(device(), (radio(-60.0),), 100.0)
-    profiler.adopt(replace(TIMING, smoothing_s=4.0))
+    profiler.retune(replace(TIMING, smoothing_s=4.0))
     profiler.absorb(device(), (radio(-70.0),), 101.0)
     (link,) = taken(profiler, 101.0).links
     assert link.rssi_dbm == pytest.approx(-60.0 - 10.0 * (1 - math.exp(-1.0 / 4.0)))

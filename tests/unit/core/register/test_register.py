@@ -277,7 +277,7 @@ def test_a_value_that_nothing_could_follow_is_not_learnt() -> None:
 def test_a_value_of_the_task_before_is_not_learnt() -> None:
     """A task that was removed and added again begins with a later revision; peers that were away tell the old ones."""
     register = make("r1")
-    register.adopt(allocation(4), ballot_s=BALLOT_S, stagger_s=STAGGER_S)
+    register.begin_with(allocation(4))
     assert not did(register.learn, allocation(3), 0.0).is_dirty
     assert register.state.learnt is None
     assert did(register.learn, allocation(4), 0.0).is_dirty

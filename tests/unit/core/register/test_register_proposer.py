@@ -276,8 +276,7 @@ def test_no_majority_gives_up_as_no_quorum() -> None:
 @pytest.mark.parametrize("timing", PROFILES.values(), ids=list(PROFILES))
 def test_two_changes_without_a_majority_end_while_an_operator_still_waits(timing: Timing) -> None:
     """The second one waits for the first, and its operator is told 'no quorum', and not that a loop hangs."""
-    register, second = make(), replace(FIRST, owner="e2")
-    register.adopt(INITIAL, ballot_s=timing.ballot_s, stagger_s=timing.stagger_s)
+    register, second = make(clocks=timing), replace(FIRST, owner="e2")
     did(register.propose, FIRST, 0.0)
     did(register.propose, second, 0.0)
     ends: list[object] = []

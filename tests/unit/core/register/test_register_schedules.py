@@ -18,6 +18,7 @@ from support.registers import BALLOT_S, INITIAL, TUNING, Step, accepted, did, pr
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.values.quorum import majority
@@ -75,8 +76,7 @@ class World:
             is_elector=name in self.electors,
             initial=INITIAL,
             state=host.disk,
-            ballot_s=BALLOT_S,
-            stagger_s=0.03,
+            clocks=lambda: Timing(ballot_s=BALLOT_S, stagger_s=0.03),
             rng=Random(self.rng.random()),
         )
         self.take(host, did(host.register.settle, self.now))

@@ -15,6 +15,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.utility import service_utility
 from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Utility, Weights
 from zsched.core.values.profile import WorkerLoad, WorkerState
 
@@ -35,7 +36,7 @@ def load(task: str, cpu: float | None = None, memory: float | None = None) -> Wo
 
 def seen(*workers: WorkerLoad, cpu: float = 1.0, memory: float = 1000.0, booked: tuple[TaskSpec, ...] = ()) -> Utility:
     """How robot1 scores edge1 for the task ``map``."""
-    gateway = Gateway(FLEET)
+    gateway = Gateway(InForce(FLEET))
     profile = profile_of(
         cpu_used_cores=cpu,
         memory_used_mb=memory,
@@ -59,7 +60,7 @@ def test_what_the_task_s_own_worker_uses_is_not_counted_twice() -> None:
 
 def test_a_task_that_came_to_a_machine_whose_cpu_is_not_measured_shows_there_after_a_while() -> None:
     """It was booked on top of the machine's memory for good: the other task found no room where there was some."""
-    gateway = Gateway(fleet_of(*TASKS, of=("edge1", "edge2", "robot1"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(*TASKS, of=("edge1", "edge2", "robot1"), electors=("robot1",))))
     for step, owner in enumerate(["edge1"] * 4 + ["edge2"] * 40):
         now = 10.0 + 0.5 * step
         held = profile_of(owner, sequence=step, cpu_used_cores=None, workers=(load("plan"),))
@@ -94,7 +95,7 @@ def test_an_owner_that_is_short_keeps_its_share_beside_what_comes_and_gets_no_mo
     spec = replace(MAP, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=3.0))
     plan = replace(PLAN, demand=Demand(cpu_cores=0.5 + coming_cores))
     fleet = fleet_of(spec, plan, of=("edge1", "edge2", "robot1"), electors=("robot1",))
-    gateway = Gateway(fleet)
+    gateway = Gateway(InForce(fleet))
     here = (load_of("map", READY, cpu_cores=1.5, wanted_cores=3.0, runnable=3.0), load("plan", 0.5))
     there = (load_of("map", READY, cpu_cores=0.0, runnable=0.0), load("plan", 0.5))
     assert gateway.absorb(profile_of("edge1", cpu_used_cores=4.0, workers=here, runnable=8.0), 10.0) is None
@@ -122,7 +123,7 @@ def test_what_somebody_else_starts_is_coming_only_until_the_machine_s_figures_sh
     plan = replace(PLAN, worker=WorkerSpec(), candidates=("edge0", "edge1"))
     fleet = fleet_of(MAP, plan, of=("edge0", "edge1", "robot1"), electors=("robot1",))
     states = dict.fromkeys(("edge0", "edge1", "robot1"), PeerState.ALIVE)
-    gateway = Gateway(fleet)
+    gateway = Gateway(InForce(fleet))
 
     def coming_cores(now: float, owner: str | None) -> float:
         """What robot1 takes for coming on edge1, by its worth for the task ``map``; the profiles say nothing of it."""
@@ -155,7 +156,7 @@ def test_what_a_failed_worker_had_come_to_use_is_not_kept_for_it() -> None:
     """An idle machine was refused for good, for the memory of a worker that is no more; the file's figure stays."""
     other = replace(PLAN, candidates=("edge1",))
     fleet = fleet_of(MAP, other, of=("edge1", "robot1"), electors=("robot1",))
-    gateway, states = Gateway(fleet), {"edge1": PeerState.ALIVE, "robot1": PeerState.ALIVE}
+    gateway, states = Gateway(InForce(fleet)), {"edge1": PeerState.ALIVE, "robot1": PeerState.ALIVE}
 
     def seen_free(number: int, plan: WorkerLoad, used: float) -> Utility:
         told = profile_of(sequence=number, cpu_used_cores=used, workers=(load("map", 0.0, 0.0), plan))
@@ -183,7 +184,7 @@ def with_gpu(owner: str | None, seen_at: str | None, reading: float, now: float)
     mine, other = (
         replace(one, candidates=nodes, demand=Demand(gpu=0.35), gauge_limits=(("gpu", 0.9),)) for one in (MAP, PLAN)
     )
-    gateway = Gateway(fleet_of(mine, other, of=(*nodes, "robot1"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(mine, other, of=(*nodes, "robot1"), electors=("robot1",))))
     times = [(-9.0, seen_at)] if seen_at else []
     for sequence, (at, plan_owner) in enumerate([*times, (0.0, "edge1"), (now, "edge1")]):
         for node in nodes:
@@ -212,7 +213,7 @@ def test_whoever_would_come_beside_it_finds_the_gpu_as_full_as_it_is_about_to_be
 def test_whatever_a_profile_tells_a_robot_can_score() -> None:
     """One frame with figures at the ends of what a profile may hold ended every robot's daemon."""
     tasks = tuple(replace(one, candidates=("edge1", "edge2")) for one in TASKS)
-    gateway = Gateway(fleet_of(*tasks, of=("edge1", "edge2", "robot1"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(*tasks, of=("edge1", "edge2", "robot1"), electors=("robot1",))))
     huge = tuple(load(one.name, cpu=4000.0, memory=1e8) for one in tasks)
     states = dict.fromkeys(("edge1", "edge2", "robot1"), PeerState.ALIVE)
     for sequence, used in enumerate((3000.0, 4096.0)):
@@ -233,7 +234,7 @@ def test_where_somebody_else_starts_the_worker_its_whole_demand_is_added() -> No
     unseen, seen_idle = (profile_of(workers=workers) for workers in ((), (load("map", 0.0, 0.0),)))
     terms = []
     for profile in (unseen, seen_idle):
-        gateway = Gateway(FLEET)
+        gateway = Gateway(InForce(FLEET))
         gateway.absorb(profile, 10.0)
         states = {"edge1": PeerState.ALIVE, "robot1": PeerState.ALIVE}
         spec = replace(TASKS[0], worker=WorkerSpec())

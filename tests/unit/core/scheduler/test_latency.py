@@ -16,6 +16,7 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.scoring import NOTHING_HELD, score
 from zsched.core.scheduler.utility import LATE_WORTH, on_time, service_utility, timely_worth
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning
 from zsched.core.values.profile import Jobs
 
@@ -38,7 +39,7 @@ def worth(
 ) -> tuple[float, float]:
     """What the owner edge1 and the candidate edge2 are worth, behind the owner's settling."""
     spec = task_of(candidates=candidates, tuning=tuning, worker=WorkerSpec(command=("x",)), demand=Demand())
-    gateway = Gateway(fleet_of(spec, of=(*candidates, "robot1")))
+    gateway = Gateway(InForce(fleet_of(spec, of=(*candidates, "robot1"))))
     for sequence, now in ((1, 0.0), (2, 10.0)):
         for name, speed, cores, threads in zip(EDGES, speeds, used, runnable, strict=True):
             told = jobs or JOBS

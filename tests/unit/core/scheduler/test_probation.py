@@ -14,6 +14,7 @@ from zsched.core.node import Node
 from zsched.core.scheduler.probation import LEASE_MARGIN_S, LIMIT_S, Probation
 from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState
 from zsched.core.values.plan import ReadyWhen
 
@@ -25,7 +26,7 @@ STOOD_S = FLEET.timing.zenoh_lease_s + LEASE_MARGIN_S
 
 def probation(*, seen_at: float | None = 50.0, is_back: bool = True) -> Probation:
     """edge1 was gone from 100 to 105 s; its worker's token came at ``seen_at``."""
-    known = Probation(FLEET)
+    known = Probation(InForce(FLEET))
     if seen_at is not None and seen_at < GONE_AT:
         known.on_token("edge1", "merge", "1", is_present=True, now=seen_at)
     known.on_gone("edge1", GONE_AT)
@@ -41,7 +42,7 @@ def doubted(known: Probation, after_s: float, spec: TaskSpec = TASK) -> bool:
 
 
 def test_a_node_that_was_never_gone_is_not_doubted() -> None:
-    assert not Probation(FLEET).doubts(TASK, 1.0)
+    assert not Probation(InForce(FLEET)).doubts(TASK, 1.0)
     known = probation(is_back=False)
     assert not known.doubts(TASK, BACK_AT), "a node that is gone is not eligible anyway"
 

@@ -20,6 +20,7 @@ from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, Asked, PeerState, Pin
 from zsched.core.values.profile import WorkerState
@@ -46,7 +47,7 @@ class Robot:
     ) -> None:
         self.me, self.now = me, 100.0
         self.states = dict.fromkeys((*ROBOTS, *EDGES), PeerState.ALIVE)
-        self.gateway = Gateway(fleet)
+        self.gateway = Gateway(InForce(fleet))
         self.decider = Decider(fleet, me, self.gateway, now=self.now)
         self.rounds, self.votes = self.decider.rounds, self.decider.votes
         revision = 0 if owner is None else 5
@@ -328,7 +329,7 @@ def test_what_too_few_electors_could_agree_to_is_not_called_for() -> None:
 def test_an_elector_that_has_left_the_document_is_silent() -> None:
     """It keeps its seat until the electors have agreed to remove it, and is no peer any more."""
     robot = Robot()
-    robot.rounds.electors = ("gone1", "robot1", "robot2")
+    robot.rounds._in_force.count(robot.rounds.voters, ("gone1", "robot1", "robot2"))
     robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
     assert proposed(robot.tick()) == []
     assert robot.task.judgement is not None
@@ -598,7 +599,7 @@ class RobotOfOrphans(RobotOfTwo):
         candidates, demand = ("edge1", "edge2", "robot3"), Demand(memory_mb=1400.0)
         need = replace(merge.file, candidates=candidates, demand=demand, memory_floor_ratio=0.0)
         fleet = replace(FLEET, tasks=(need, replace(need, name="plan", candidates=plan_on)))
-        self.gateway = Gateway(fleet)
+        self.gateway = Gateway(InForce(fleet))
         self.decider = Decider(fleet, me, self.gateway, now=self.now)
         self.rounds, self.votes = self.decider.rounds, self.decider.votes
         self.value, self.plan = (replace(one, revision=5, owner="edge1") for one in (self.value, self.plan))
@@ -657,7 +658,7 @@ def test_an_elector_that_was_never_heard_is_not_counted_as_heard() -> None:
 def test_a_task_of_the_same_name_begins_without_the_memory_of_the_one_before() -> None:
     robot = RobotOfTwo("robot1")
     before = dict(robot.rounds.tasks)
-    robot.rounds.adopt(robot.rounds._fleet, robot.now, frozenset({"plan"}))
+    robot.rounds.on_fleet(robot.now, frozenset({"plan"}))
     assert robot.rounds.tasks["merge"] is before["merge"]
     assert robot.rounds.tasks["plan"] is not before["plan"]
 

@@ -17,6 +17,7 @@ from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import LOST_S, compare, pick, reaches_owner
 from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import (
     Allocation,
     PairReading,
@@ -74,7 +75,7 @@ def scored(
 ) -> UtilityVector:
     names = sorted({*spec.candidates, voter, *(one.node for one in profiles)})
     fleet = fleet_of(spec, of=names, electors=(voter,))
-    gateway = Gateway(fleet)
+    gateway = Gateway(InForce(fleet))
     for one in profiles:
         assert gateway.absorb(one, 0.0) is None
     seen = dict.fromkeys(names, PeerState.ALIVE) | dict(states or {})
@@ -476,7 +477,7 @@ def test_what_a_worker_has_come_to_hold_forbids_a_machine_only_while_the_task_ha
 ) -> None:
     """A worker that leaked, or that sized its heap by its machine: without its owner nobody would have room for it."""
     spec = replace(SPEC, demand=Demand(memory_mb=wanted_mb))
-    gateway = Gateway(fleet_of(spec, of=(*spec.candidates, "robot1")))
+    gateway = Gateway(InForce(fleet_of(spec, of=(*spec.candidates, "robot1"))))
     for one in (profile("edge1", memory=3500.0, own=(0.5, 3000.0)), profile("edge2", memory=3000.0), ROBOT):
         assert gateway.absorb(one, 0.0) is None
     gateway.learn_demand("merge", "edge1", 0.0)
@@ -496,7 +497,7 @@ def test_what_a_worker_has_come_to_hold_forbids_a_machine_only_while_the_task_ha
 
 def test_a_machine_that_took_the_task_without_room_for_all_that_it_held_keeps_it() -> None:
     spec = replace(SPEC, tuning=Tuning(weights=CPU))
-    gateway = Gateway(fleet_of(spec, of=(*spec.candidates, "robot1")))
+    gateway = Gateway(InForce(fleet_of(spec, of=(*spec.candidates, "robot1"))))
     for one in (profile("edge1", memory=3500.0, own=(0.5, 3000.0)), profile("edge2", memory=3000.0), ROBOT):
         assert gateway.absorb(one, 0.0) is None
     gateway.learn_demand("merge", "edge1", 0.0)
@@ -750,7 +751,7 @@ def test_a_node_without_a_gpu_cannot_have_a_task_that_weighs_it_and_one_without_
 
 def failing(*profiles: Profile, spec: TaskSpec = SPEC, agreed: Allocation, life: int = 0) -> UtilityVector:
     """The profiles arrive, then each node's next one without any gauge, from the ``life``-th life after."""
-    gateway = Gateway(fleet_of(spec, of=("edge1", "edge2", "edge3", "robot1"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(spec, of=("edge1", "edge2", "edge3", "robot1"), electors=("robot1",))))
     for one in profiles:
         assert gateway.absorb(one, 0.0) is None
         without = replace(one, gauges=(), sequence=1, incarnation=one.incarnation + life)

@@ -18,6 +18,7 @@ from zsched.core.scheduler.turns import in_turn, who_moves_first
 from zsched.core.scheduler.usage import book
 from zsched.core.scheduler.utility import service_utility
 from zsched.core.values.fleet import Demand, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, PeerState, ScoreForm, Tuning, UtilityVector, Weights
 from zsched.core.values.profile import DeviceSample, WorkerLoad, WorkerState
 from zsched.core.vote.voting import Voting
@@ -74,7 +75,7 @@ def test_who_has_proposed_longest_ago_is_judged_first() -> None:
 
 def test_a_move_keeps_its_turn_for_a_second_try_and_loses_it_then_or_when_it_has_succeeded() -> None:
     """An owner that is slow to stop leaves by the next vote, if that comes before its lease is granted again."""
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     voting.call(3.0)
     assert voting.called_at == -math.inf, "it is first again"
     voting.call(5.0)
@@ -105,7 +106,7 @@ def scored_b(gateway: Gateway, agreed: dict[str, Allocation]) -> UtilityVector:
 
 
 def gateway_with(*workers_on_edge1: WorkerLoad, memory_mb: float = 1000.0) -> Gateway:
-    gateway, idle = Gateway(FLEET), load_of("b", cpu_cores=0.0, memory_mb=0.0)
+    gateway, idle = Gateway(InForce(FLEET)), load_of("b", cpu_cores=0.0, memory_mb=0.0)
     for node, shown in (("edge1", workers_on_edge1), ("edge2", ())):
         workers = shown if any(load.task == "b" for load in shown) else (*shown, idle)
         seen_cores = sum(load.cpu_cores or 0.0 for load in workers)
@@ -160,7 +161,7 @@ def test_memory_that_another_worker_holds_and_no_process_shows_leaves_no_task_wi
 ) -> None:
     """A board whose GPU uses the machine's memory: a asks for 3000 MiB, and 500 of them show."""
     large = replace(A, demand=Demand(memory_mb=3000.0))
-    gateway = Gateway(fleet_of(large, B, of=("edge1", "edge2"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(large, B, of=("edge1", "edge2"), electors=("robot1",))))
     workers = (load_of("a", cpu_cores=0.1, memory_mb=500.0), load_of("b", cpu_cores=0.0, memory_mb=50.0))
     at_home = profile_of(memory_mb=6500.0, memory_used_mb=1500.0 + 3000.0, workers=workers)
     away = profile_of("edge2", memory_mb=6500.0, workers=(load_of("b", cpu_cores=0.0, memory_mb=50.0),))
@@ -178,7 +179,7 @@ def test_memory_that_another_worker_holds_and_no_process_shows_leaves_no_task_wi
 def test_two_tasks_that_fit_a_machine_keep_it_though_a_robot_has_just_begun_to_look(mine: str) -> None:
     """Both hold memory that no process shows: 1500 by others, 3000 and 1850 by theirs, of 6500."""
     specs = {"a": replace(A, demand=Demand(memory_mb=3000.0)), "b": replace(B, demand=Demand(memory_mb=1850.0))}
-    gateway = Gateway(fleet_of(*specs.values(), of=("edge1", "edge2"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(*specs.values(), of=("edge1", "edge2"), electors=("robot1",))))
     workers = (load_of("a", cpu_cores=0.1, memory_mb=500.0), load_of("b", cpu_cores=0.1, memory_mb=50.0))
     gateway.absorb(profile_of(memory_mb=6500.0, memory_used_mb=6350.0, workers=workers), 0.0)
     for name in specs:
@@ -198,7 +199,7 @@ STARVED_A, STARVED_B = (
 
 def terms_of_a(*, used: float, of_a: float, of_b: float, wants: float | None = 2.0) -> tuple[float, float]:
     """What edge1, which owns a and b, and edge2 are worth to a: 2 cores each, and edge2 has 0.2 free."""
-    gateway = Gateway(fleet_of(STARVED_A, STARVED_B, of=("edge1", "edge2"), electors=("robot1",)))
+    gateway = Gateway(InForce(fleet_of(STARVED_A, STARVED_B, of=("edge1", "edge2"), electors=("robot1",))))
     for node, cores, figures in (("edge1", used, (of_a, of_b)), ("edge2", 1.8, (0.0, 0.0))):
         workers = tuple(
             load_of(name, cpu_cores=own, memory_mb=100.0, wanted_cores=wants if own else None)
@@ -240,7 +241,7 @@ TWO = tuple(task_of(name, demand=Demand(gpu=0.4), tuning=ON_GPU, price_s=0.3) fo
 def test_two_tasks_that_leave_one_gpu_at_the_same_moment_do_not_go_together() -> None:
     """Each moves by its own figures; the second one comes a round later, before the first one's use shows."""
     fleet = fleet_of(*TWO, of=("edge1", "edge2"), electors=("robot1",))
-    gateway, owners = Gateway(fleet), {"a": "edge1", "b": "edge1"}
+    gateway, owners = Gateway(InForce(fleet)), {"a": "edge1", "b": "edge1"}
     profilers = {name: Profiler(name, 1, fleet.timing) for name in ("edge1", "edge2")}
     moves = 0
     for step in range(300):

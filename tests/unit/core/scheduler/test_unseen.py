@@ -10,6 +10,7 @@ from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.scheduler.probation import Probation
 from zsched.core.scheduler.unseen import LONGEST_GAP_S, UNSEEN_S, Unseen
 from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
+from zsched.core.values.in_force import InForce
 from zsched.core.values.plan import ReadyWhen
 
 TASK = task_of(tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("true",)))
@@ -23,8 +24,9 @@ class Robot:
 
     def __init__(self, *seen: str, spec: TaskSpec = TASK) -> None:
         self.spec, self.now = spec, 100.0
-        self.tokens = Probation(fleet_of(TASK, OTHER, of=TASK.candidates, electors=("edge1",)))
-        self.unseen, self.period_s = Unseen(), STEP_S
+        self.here = InForce(fleet_of(TASK, OTHER, of=TASK.candidates, electors=("edge1",)))
+        self.tokens = Probation(self.here)
+        self.unseen, self.period_s = Unseen(self.here), STEP_S
         self.owner: str | None = "edge2"
         self.is_ours = self.is_enough = False
         for name in seen:
@@ -134,13 +136,6 @@ def test_an_owner_that_comes_and_goes_is_left_while_it_is_away_and_not_when_it_c
     assert come_and_go(robot, 3) == [set(), set(), set(), set(), {"edge1"}, set()]
 
 
-def test_a_node_of_the_same_name_that_comes_later_has_not_come_and_gone() -> None:
-    robot = Robot("edge2", "edge1")
-    come_and_go(robot, 4)
-    robot.unseen.adopt({"merge"}, {"edge2"})
-    assert robot.look() == set()
-
-
 def test_a_token_that_is_away_for_a_moment_now_and_then_is_no_reason() -> None:
     robot = Robot("edge2", "edge1")
     assert come_and_go(robot, 20, away_s=4.0, there_s=41.0) == [set()] * 40
@@ -205,7 +200,7 @@ def test_nothing_is_told_any_more_of_a_task_whose_workers_show_no_token_from_now
 def test_a_task_that_is_gone_is_forgotten() -> None:
     robot = Robot("edge2")
     robot.pass_time(UNSEEN_S)
-    robot.unseen.adopt({"other"}, {*EDGES})
+    robot.here.take(replace(robot.here.fleet, tasks=(OTHER,)))
     assert robot.unseen.found == {}
-    robot.unseen.adopt({"merge"}, {*EDGES})
+    robot.here.take(replace(robot.here.fleet, tasks=(TASK, OTHER)))
     assert robot.pass_time(UNSEEN_S - 0.01) == set()

@@ -13,7 +13,7 @@ from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.states import state_of
-from support.todos import agreed
+from support.todos import agreed, under
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
@@ -22,6 +22,7 @@ from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner, Retune, SetHold, SetLeased
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
     Accept,
     Accepted,
@@ -51,7 +52,7 @@ ADA = Asked(by="ada@robot1")
 def make(*registers: RegisterState, me: str = "robot1", has_state: bool = True, fleet: Fleet = FLEET) -> Agreement:
     state = state_of(me, *registers, hardware="h")
     agreement = Agreement(
-        fleet=fleet,
+        in_force=InForce(fleet),
         me=me,
         durable=state if has_state else None,
         incarnation=7,
@@ -175,7 +176,7 @@ def test_command_whose_accept_left_and_was_not_answered_ends_as_unknown() -> Non
 def test_a_command_whose_task_leaves_the_fleet_meanwhile_is_answered(change: MoveOwner | Retune | SetHold) -> None:
     agreement = make()
     assert told(agreed(agreement.propose, "merge", change, 100.0)) is None
-    result = told(agreed(agreement.adopt, replace(FLEET, tasks=FLEET.tasks[1:]), 100.1))
+    result = told(under(agreement, replace(FLEET, tasks=FLEET.tasks[1:]), 100.1))
     assert result == CommandResult(outcome=CommandOutcome.INVALID, detail="merge has left the fleet")
 
 
@@ -185,7 +186,7 @@ def test_a_command_whose_task_leaves_the_fleet_meanwhile_is_answered(change: Mov
 def test_nobody_waits_for_the_end_of_a_change_that_nobody_has_ordered(change: MoveOwner | SetLeased) -> None:
     agreement = make()
     agreed(agreement.propose, "merge", change, 100.0)
-    assert told(agreed(agreement.adopt, replace(FLEET, tasks=FLEET.tasks[1:]), 100.1)) is None
+    assert told(under(agreement, replace(FLEET, tasks=FLEET.tasks[1:]), 100.1)) is None
 
 
 def test_answers_of_strangers_are_counted_and_complete_no_majority() -> None:
@@ -558,7 +559,9 @@ def test_disputed_name_is_no_elector_in_this_life_and_the_next() -> None:
     state = agreement.to_persist(100.0)
     assert state is not None
     assert "another daemon" in state.disputed
-    again = Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=0.0)
+    again = Agreement(
+        in_force=InForce(FLEET), me="robot1", durable=state, incarnation=8, electorate="e", rng=Random(1), now=0.0
+    )
     assert not again.is_elector
     assert "--settle" in again.problems["state", ""]
 
@@ -567,7 +570,9 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
     state = make().to_persist(100.0)
     assert state is not None
     lost = replace(state, lost="peers remember 9 votes, here are 3")
-    again = Agreement(fleet=FLEET, me="robot1", durable=lost, incarnation=8, electorate="e", rng=Random(1), now=0.0)
+    again = Agreement(
+        in_force=InForce(FLEET), me="robot1", durable=lost, incarnation=8, electorate="e", rng=Random(1), now=0.0
+    )
     assert not again.is_elector
     assert again.problems["state", ""].startswith(
         "peers remember 9 votes, here are 3: it was brought back from a backup"
@@ -578,7 +583,9 @@ def test_a_state_that_was_brought_back_says_so_in_this_life_and_the_next() -> No
     assert kept.lost == lost.lost
     value = replace(founded(FLEET.name, 0, FLEET.electors), document="0d", revision=3)
     agreed = replace(lost, fleet_register=RegisterState(task=FLEET.name, learnt=value))
-    other = Agreement(fleet=FLEET, me="robot1", durable=agreed, incarnation=8, electorate="e", rng=Random(1), now=0.0)
+    other = Agreement(
+        in_force=InForce(FLEET), me="robot1", durable=agreed, incarnation=8, electorate="e", rng=Random(1), now=0.0
+    )
     assert other.problems["state", ""].endswith("which `electorate: auto` does by itself once its old seat is given up")
 
 
@@ -603,7 +610,7 @@ def test_another_generation_is_shown_until_it_is_silent_or_out_of_the_file() -> 
     assert agreement.problems == {}
     agreed(agreement.on_learnt, other, 200.0)
     assert ("generation", "edge1") in agreement.problems
-    agreement.adopt(fleet_of(task_of("merge", ("robot2",)), of=ROBOTS, electors=ROBOTS), ToDo(), 200.1)
+    under(agreement, fleet_of(task_of("merge", ("robot2",)), of=ROBOTS, electors=ROBOTS), 200.1)
     assert agreement.problems == {}
 
 

@@ -12,6 +12,7 @@ from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of
 from zsched.core.register.register import MAX_REVISION
 from zsched.core.register.task_register import TaskRegister
+from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION, is_fit, is_proven
@@ -33,8 +34,7 @@ def register(learnt: Allocation | None = None, accepted: Allocation | None = Non
         is_elector=True,
         initial=TASK.first_value(0),
         state=RegisterState(task="merge", promised=ballot, accepted=held, learnt=learnt),
-        ballot_s=1.0,
-        stagger_s=0.1,
+        clocks=lambda: Timing(ballot_s=1.0, stagger_s=0.1),
         rng=Random(1),
     )
 

@@ -23,6 +23,7 @@ from support.registers import (
 )
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting
@@ -68,7 +69,7 @@ def test_the_first_placement_is_a_change() -> None:
 
 
 def test_a_vote_that_ends_in_stay_commits_nothing_and_awaits_nothing() -> None:
-    voting = Voting(FLEET, "r1")
+    voting = Voting(InForce(FLEET), "r1")
     for voter, candidate in (("r2", "e2"), ("r1", "e1"), ("r3", "e1")):
         paper = proposal_of(voter, candidate, base_revision=3, aggregate=1.0)
         voting.absorb(paper, TODAY, 10.0)

@@ -21,6 +21,7 @@ from zsched.core.electorate.changes import AddElector, AdoptDocument
 from zsched.core.electorate.founding import founded
 from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Elector, FleetValue
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
     MOST_BALLOTS,
     Accept,
@@ -51,7 +52,7 @@ FLEET = fleet_of(
 
 def elector(*registers: RegisterState) -> Agreement:
     agreement = Agreement(
-        fleet=FLEET,
+        in_force=InForce(FLEET),
         me="robot1",
         durable=state_of("robot1", *registers),
         incarnation=7,
@@ -258,7 +259,7 @@ def elector_of_a_change(*, has_accepted: bool = True) -> Agreement:
     if has_accepted:
         held = replace(held, accepted=Acceptance(ballot=ballot_of(4, "robot2"), value=CHANGED))
     agreement = Agreement(
-        fleet=FLEET,
+        in_force=InForce(FLEET),
         me="robot1",
         durable=replace(state_of("robot1"), disk="d1", fleet_register=held),
         incarnation=7,
@@ -357,7 +358,14 @@ def test_only_a_newer_fleet_value_of_the_own_generation_is_asked_for(told: Fleet
 
 def test_a_node_that_knows_no_generation_asks_nobody_for_a_fleet_value() -> None:
     blank = Agreement(
-        fleet=FLEET, me="robot1", durable=None, incarnation=7, electorate="e", rng=Random(1), now=100.0, stored={}
+        in_force=InForce(FLEET),
+        me="robot1",
+        durable=None,
+        incarnation=7,
+        electorate="e",
+        rng=Random(1),
+        now=100.0,
+        stored={},
     )
     assert not any(isinstance(it, do.AskLearnt) for it in asked_along_with(blank, CHANGED).send)
 

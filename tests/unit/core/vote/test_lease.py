@@ -12,6 +12,7 @@ from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, lease_terms
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.model import Allocation
 from zsched.core.vote.lease import HURRY_S, Granter, Leases
@@ -38,7 +39,9 @@ def grant(number: int, owner: str = "r2", epoch: int = 3) -> Grant:
 
 
 def elector(fleet: Fleet = FLEET, standing: Allocation | None = None, granted_s: float = 0.0) -> Leases:
-    return Leases(fleet=fleet, me="r1", incarnation=1, standing={"guard": standing}, now=0.0, granted_s=granted_s)
+    return Leases(
+        in_force=InForce(fleet), me="r1", incarnation=1, standing={"guard": standing}, now=0.0, granted_s=granted_s
+    )
 
 
 def granter() -> Granter:
@@ -49,7 +52,7 @@ def granter() -> Granter:
 
 
 def owner(*, echoed: int | None = 5) -> Leases:
-    held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
+    held = Leases(in_force=InForce(FLEET), me="r1", incarnation=1, standing={}, now=0.0)
     held.begin("guard", 3, 5)
     held.on_sent(5, 10.0)
     for name in NAMES[1:] if echoed is not None else ():
@@ -79,7 +82,8 @@ def test_the_first_value_of_a_generation_waits_for_the_one_before_also_over_a_re
     first = Allocation(task="guard", revision=1 << 32, epoch=1 << 32, owner=None, tuning=tuning_of())
     one = elector(OPEN, first)
     assert not one.may_accept("guard", "r3", 0.1)
-    one.adopt(OPEN, {"guard": first}, 0.2)
+    one.in_force.take(OPEN)
+    one.on_tasks({"guard": first}, 0.2)
     assert not one.may_accept("guard", "r3", 0.3)
     assert one.may_accept("guard", "r3", HOLD_S)
 
@@ -101,7 +105,8 @@ def test_a_generation_s_task_that_becomes_exclusive_before_its_first_owner_is_wa
     if is_agreed:
         one.on_newer_value(value())
     else:
-        one.adopt(FLEET, {"guard": first}, 0.2)
+        one.in_force.take(FLEET)
+        one.on_tasks({"guard": first}, 0.2)
     owned = value(leased=is_agreed)
     one.on_newer_value(owned)
     one.doubt({"guard": owned})
@@ -207,7 +212,7 @@ def test_the_epoch_that_counts_is_that_of_the_task() -> None:
 
 
 def test_who_is_no_elector_grants_nothing() -> None:
-    one = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
+    one = Leases(in_force=InForce(FLEET), me="r1", incarnation=1, standing={}, now=0.0)
     one.on_newer_value(value())
     assert not one.on_beat(beat(), ACCEPTED, 10.0)
     assert one.on_sent(1, 10.0).echoes == ()
@@ -307,7 +312,7 @@ def test_a_word_that_has_come_is_not_waited_for_any_more() -> None:
 
 
 def test_a_node_that_owns_nothing_has_no_lease_and_is_asked_for_none() -> None:
-    held = Leases(fleet=FLEET, me="r1", incarnation=1, standing={}, now=0.0)
+    held = Leases(in_force=InForce(FLEET), me="r1", incarnation=1, standing={}, now=0.0)
     assert not held.on_beat(asked(), {}, 10.2)
     assert (held.until("guard"), held.given_until("guard"), held.leaving()) == (-math.inf, -math.inf, ())
 
@@ -336,7 +341,7 @@ R2_HOLDS_UNTIL = 10.0 + LONG_S
 
 def granting() -> Leases:
     """An elector that has echoed beat 5 of r2 at 10 s, under long leases."""
-    one = Leases(fleet=LONG, me="r1", incarnation=1, standing={"guard": value()}, now=0.0)
+    one = Leases(in_force=InForce(LONG), me="r1", incarnation=1, standing={"guard": value()}, now=0.0)
     sent = replace(beat(), lease_terms=lease_terms(LONG))
     assert one.on_beat(sent, ACCEPTED, 10.0)
     return one
@@ -346,21 +351,26 @@ def test_what_was_granted_before_three_changes_within_a_lease_still_excludes_oth
     """The lease is made shorter, its task removed and created again: r3 is not accepted while r2 may be at work."""
     one = granting()
     one.count_with(NAMES, terms="t/2", number=2, lease_s=L, standing={"guard": None}, guard_lease_s=LONG_S)
-    one.adopt(WITHOUT, {"other": None}, 10.2)
-    one.adopt(FLEET, {"guard": None, "other": None}, 10.4)
+    one.in_force.take(WITHOUT)
+    one.on_tasks({"other": None}, 10.2)
+    one.in_force.take(FLEET)
+    one.on_tasks({"guard": None, "other": None}, 10.4)
     assert not one.may_accept("guard", "r3", R2_HOLDS_UNTIL - 0.01)
     assert one.may_accept("guard", "r3", 10.4 + hold_s(LONG_S))
 
 
 def test_an_elector_that_never_knew_of_long_leases_waits_for_them_too() -> None:
     """The electors may be others by then: all of them go by what the fleet value says may still run."""
-    one = Leases(fleet=WITHOUT, me="r1", incarnation=1, standing={"other": None}, now=0.0)
+    one = Leases(in_force=InForce(WITHOUT), me="r1", incarnation=1, standing={"other": None}, now=0.0)
     one.count_with(NAMES, terms="t/4", number=4, lease_s=L, standing={"other": None}, guard_lease_s=LONG_S)
-    one.adopt(FLEET, {"guard": None, "other": None}, 10.4)
+    one.in_force.take(FLEET)
+    one.on_tasks({"guard": None, "other": None}, 10.4)
     assert not one.may_accept("guard", "r3", R2_HOLDS_UNTIL - 0.01)
     one.count_with(NAMES, terms="t/4", number=4, lease_s=L, standing={"guard": None}, guard_lease_s=L)
-    one.adopt(WITHOUT, {"other": None}, 20.0)
-    one.adopt(FLEET, {"guard": None, "other": None}, 20.0)
+    one.in_force.take(WITHOUT)
+    one.on_tasks({"other": None}, 20.0)
+    one.in_force.take(FLEET)
+    one.on_tasks({"guard": None, "other": None}, 20.0)
     assert one.may_accept("guard", "r3", 20.0 + HOLD_S), "a guard time was waited for meanwhile"
 
 
@@ -368,14 +378,17 @@ def test_the_release_of_a_task_that_has_gone_is_in_no_beat_any_more() -> None:
     """Else beats grow by one for each exclusive task that was ever removed."""
     held = owner()
     held.end("guard", 6)
-    held.adopt(FLEET, {"guard": value("r2")}, 10.2)
+    held.in_force.take(FLEET)
+    held.on_tasks({"guard": value("r2")}, 10.2)
     assert [one.task for one in held.on_sent(7, 10.3).released] == ["guard"]
-    held.adopt(WITHOUT, {"other": None}, 10.4)
+    held.in_force.take(WITHOUT)
+    held.on_tasks({"other": None}, 10.4)
     assert held.on_sent(8, 10.5).released == ()
 
 
 def test_a_task_that_stays_in_the_fleet_waits_for_no_lease_again() -> None:
     one = elector()
     assert one.may_accept("guard", "r3", 100.0)
-    one.adopt(FLEET, {"guard": None}, 100.0)
+    one.in_force.take(FLEET)
+    one.on_tasks({"guard": None}, 100.0)
     assert one.may_accept("guard", "r3", 100.0)

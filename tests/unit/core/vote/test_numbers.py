@@ -16,7 +16,7 @@ from support.ballots import ballot_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from support.states import state_of
-from support.todos import agreed
+from support.todos import agreed, under
 from zsched.core import events as ev
 from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, RemoveElector, SetDocument, SetLease
@@ -27,6 +27,7 @@ from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import (
     Accept,
@@ -84,7 +85,7 @@ def make(
         disputed=disputed,
     )
     agreement = Agreement(
-        fleet=FLEET,
+        in_force=InForce(FLEET),
         me=me,
         durable=state if has_state else None,
         incarnation=7,
@@ -436,7 +437,9 @@ def test_another_fleet_s_value_changes_nothing_though_it_tells_the_same_generati
 def test_a_state_that_tells_no_fleet_value_is_refused() -> None:
     state = state_of("robot1", hardware="h", disk="d1", fleet_register=RegisterState(task=FLEET.name))
     with pytest.raises(ValueError, match="none is learnt"):
-        Agreement(fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0)
+        Agreement(
+            in_force=InForce(FLEET), me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
+        )
 
 
 def test_a_value_that_names_no_document_leaves_the_node_with_the_fleet_that_it_goes_by() -> None:
@@ -476,7 +479,7 @@ def test_an_accepted_value_whose_document_is_gone_at_a_start_is_followed_once_it
     held = RegisterState(task=FLEET.name, learnt=FIRST, promised=accepted.ballot, accepted=accepted)
     state = state_of("robot1", generation=GENERATION, hardware="h", disk="d1", fleet_register=held)
     agreement = Agreement(
-        fleet=FLEET, me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
+        in_force=InForce(FLEET), me="robot1", durable=state, incarnation=7, electorate="e", rng=Random(1), now=100.0
     )
     told = Learnt(node="robot2", values=(), generation=GENERATION, fleet=value)
     todo = agreed(agreement.on_learnt, ev.LearntReceived(learnt=told, is_answer=False), 100.1)
@@ -565,9 +568,8 @@ def test_an_elector_without_its_document_remembers_the_tasks_that_its_file_lacks
     written = elector.to_persist(100.0)
     assert written is not None
     assert written.registers == states
-    todo = ToDo()
-    elector.on_stored(ev.DocumentStored(document="0d", fleet=document), todo, 100.1)
-    elector.adopt(document, todo, 100.1)
+    elector.on_stored(ev.DocumentStored(document="0d", fleet=document), ToDo(), 100.1)
+    under(elector, document, 100.1)
     assert tuple(register.state for register in elector.registers.values()) == states
     assert elector.document_hash == "0d"
     again = elector.to_persist(100.2)
@@ -582,7 +584,7 @@ L = FLEET.timing.lease_s
 
 
 def leases(me: str = "robot1") -> Leases:
-    return Leases(fleet=FLEET, me=me, incarnation=1, standing={"merge": HELD}, now=0.0)
+    return Leases(in_force=InForce(FLEET), me=me, incarnation=1, standing={"merge": HELD}, now=0.0)
 
 
 def renumbered(one: Leases, number: int = 2, lease_s: float = L, electors: tuple[str, ...] = ROBOTS) -> Leases:
@@ -766,7 +768,9 @@ def test_lease_shortened_the_next_life_still_waits_for_a_grant_of_before() -> No
     elector.on_beat(beat(2, sequence=7), OWNERS, 10.2)
     shorter = replace(FLEET, timing=replace(FLEET.timing, lease_s=L / 10))
     granted_s = elector.to_remember_s(10.3)
-    next_life = Leases(fleet=shorter, me="robot1", incarnation=2, standing={}, now=10.3, granted_s=granted_s)
+    next_life = Leases(
+        in_force=InForce(shorter), me="robot1", incarnation=2, standing={}, now=10.3, granted_s=granted_s
+    )
     assert next_life.over_at >= over_at
 
 
@@ -785,7 +789,9 @@ def test_lease_shortened_a_clock_in_doubt_does_not_end_the_guard_of_a_grant_of_b
 
 
 def test_a_clock_in_doubt_after_a_start_does_not_end_the_guard_of_the_life_before() -> None:
-    elector = Leases(fleet=FLEET, me="robot1", incarnation=1, standing={"merge": HELD}, now=0.0, granted_s=3 * L)
+    elector = Leases(
+        in_force=InForce(FLEET), me="robot1", incarnation=1, standing={"merge": HELD}, now=0.0, granted_s=3 * L
+    )
     elector.doubt({"merge": HELD})
     elector.trust({"merge": HELD}, 9, 0.2)
     assert not elector.may_accept("merge", "robot3", hold_s(3 * L) - 0.01)
@@ -813,7 +819,7 @@ def test_task_removed_and_added_grants_are_remembered_by_name() -> None:
 
 
 def test_a_node_that_becomes_an_elector_grants() -> None:
-    spare = Leases(fleet=FLEET, me="edge1", incarnation=1, standing={}, now=0.0)
+    spare = Leases(in_force=InForce(FLEET), me="edge1", incarnation=1, standing={}, now=0.0)
     assert not spare.on_beat(beat(0), OWNERS, 10.0)
     renumbered(spare, electors=NAMES)
     assert spare.on_beat(beat(2, sequence=6), OWNERS, 10.1)

@@ -18,6 +18,7 @@ from zsched.core.node import Node
 from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.durable import DurableState
+from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
@@ -42,7 +43,7 @@ def disk() -> DurableState:
 def elector() -> Agreement:
     """An elector that has just started, with robot2 as owner on its disk: nobody else is accepted for a hold."""
     agreement = Agreement(
-        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0
+        in_force=InForce(FLEET), me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0
     )
     for name in ROBOTS[1:]:
         agreement.witness.on_answer(Learnt(node=name, values=()))  # they remember no later life of it
@@ -171,7 +172,7 @@ def test_a_question_that_waits_is_answered_though_no_task_is_exclusive_any_more(
     accept = Accept(task="guard", acceptance=Acceptance(ballot=ballot, value=value(4, "robot3")), electorate="e")
     node.handle(ev.AcceptAsked(request=1, asker="robot3", accept=accept), 100.1)
     assert node.agreement.acceptor.has_parked
-    node.tenure.exclusive = ()
+    node.executors["guard"].is_leased = False
     now = 100.1 + PARKED_S
     told = [one for one in node.handle(ev.DeadlineReached(), now) if isinstance(one, do.AnswerElection)]
     assert [one.request for one in told] == [1]

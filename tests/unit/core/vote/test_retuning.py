@@ -11,7 +11,8 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.values.change import Retune
-from zsched.core.values.fleet import LinkLimits
+from zsched.core.values.fleet import Fleet, LinkLimits
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Aggregate, Allocation, Reach, Tuning, Weights
 from zsched.core.vote.retuning import AGAIN_S, RANK_S, Retuning
 
@@ -19,12 +20,18 @@ FILE = tuning_of(bonus=0.05)
 CPU, MEMORY = Weights(cpu=1.0, memory=0.0, network=0.0), Weights(cpu=0.0, memory=1.0, network=0.0)
 
 
+def take(retuning: Retuning, old: Fleet, new: Fleet, values: dict[str, Allocation], now: float) -> None:
+    """Another file is in force."""
+    retuning.in_force.take(new)
+    retuning.want(old, values, now)
+
+
 def wished(agreed: Tuning, before: dict[str, Any], after: dict[str, Any], *, me: str = "edge1") -> Tuning | None:
     """What a node wants agreed that takes over a file with another task; ``None``: nothing."""
     old, new = (fleet_of(task_of(**{"tuning": FILE, **options})) for options in (before, after))
     value = replace(allocation_of(5, "edge1"), tuning=agreed)
-    retuning = Retuning(me)
-    retuning.adopt(old, new, {"merge": value}, 0.0)
+    retuning = Retuning(me, InForce(old))
+    take(retuning, old, new, {"merge": value}, 0.0)
     due = list(retuning.due({"merge": value}, 100.0))
     assert all(retune.base_revision == 5 for _, retune in due)
     return due[0][1].tuning if due else None
@@ -70,8 +77,8 @@ def test_a_tuning_that_comes_between_is_the_newer_word() -> None:
     old, new = fleet_of(task_of(tuning=FILE, price_s=0.3)), fleet_of(task_of(tuning=FILE, price_s=0.4))
     value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, price_s=0.7))
     newer: Allocation = replace(value, revision=6, tuning=replace(FILE, price_s=0.9))
-    retuning = Retuning("edge2")
-    retuning.adopt(old, new, {"merge": value}, 0.0)
+    retuning = Retuning("edge2", InForce(fleet_of(task_of(tuning=FILE))))
+    take(retuning, old, new, {"merge": value}, 0.0)
     assert list(retuning.due({"merge": value}, 0.0)) == [], "the first in rank tries before this node"
     assert list(retuning.due({"merge": newer}, RANK_S)) == []
     assert retuning.is_idle
@@ -82,11 +89,11 @@ def test_a_second_changed_file_does_not_end_what_the_first_one_wants() -> None:
     tunings = (FILE, replace(FILE, aggregate=Aggregate.MEDIAN), replace(FILE, aggregate=Aggregate.MEDIAN, bonus=0.2))
     first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
-    retuning = Retuning("edge2")
-    retuning.adopt(first, second, {"merge": value}, 0.0)
-    retuning.adopt(second, third, {"merge": value}, 0.1)
+    retuning = Retuning("edge2", InForce(fleet_of(task_of(tuning=FILE))))
+    take(retuning, first, second, {"merge": value}, 0.0)
+    take(retuning, second, third, {"merge": value}, 0.1)
     assert [retune.tuning for _, retune in retuning.due({"merge": value}, 9.0)] == [tunings[2]]
-    retuning.adopt(third, first, {"merge": value}, 10.0)
+    take(retuning, third, first, {"merge": value}, 10.0)
     assert list(retuning.due({"merge": value}, 99.0)) == [], "both are taken back"
     assert retuning.is_idle
 
@@ -96,9 +103,9 @@ def test_what_an_earlier_file_wanted_ends_with_a_tuning_that_came_between() -> N
     first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
     newer = replace(value, revision=6, tuning=replace(FILE, weights=MEMORY))
-    retuning = Retuning("edge2")
-    retuning.adopt(first, second, {"merge": value}, 0.0)
-    retuning.adopt(second, third, {"merge": newer}, 0.1)
+    retuning = Retuning("edge2", InForce(fleet_of(task_of(tuning=FILE))))
+    take(retuning, first, second, {"merge": value}, 0.0)
+    take(retuning, second, third, {"merge": newer}, 0.1)
     (due,) = retuning.due({"merge": newer}, 9.0)
     assert due[1].tuning == replace(newer.tuning, bonus=0.2)
 
@@ -106,8 +113,8 @@ def test_what_an_earlier_file_wanted_ends_with_a_tuning_that_came_between() -> N
 def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() -> None:
     old, new = fleet_of(task_of(tuning=FILE, price_s=0.3)), fleet_of(task_of(tuning=FILE, price_s=0.4))
     value = replace(allocation_of(5, "edge1"), tuning=replace(FILE, price_s=0.7))
-    retuning = Retuning("edge1")
-    retuning.adopt(old, new, {"merge": value}, 0.0)
+    retuning = Retuning("edge1", InForce(fleet_of(task_of(tuning=FILE))))
+    take(retuning, old, new, {"merge": value}, 0.0)
     wanted = [("merge", Retune(base_revision=5, tuning=FILE))]
     assert list(retuning.due({"merge": value}, 0.0)) == wanted
     assert list(retuning.due({"merge": value}, AGAIN_S - 0.1)) == []
@@ -122,9 +129,9 @@ def test_a_second_file_wants_what_the_first_one_wanted_too() -> None:
     tunings = FILE, replace(FILE, bonus=0.2), replace(FILE, bonus=0.2, aggregate=Aggregate.MEDIAN)
     files = [fleet_of(task_of(tuning=tuning)) for tuning in tunings]
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
-    retuning = Retuning("edge2")
+    retuning = Retuning("edge2", InForce(fleet_of(task_of(tuning=FILE))))
     for old, new in itertools.pairwise(files):
-        retuning.adopt(old, new, {"merge": value}, 0.0)
+        take(retuning, old, new, {"merge": value}, 0.0)
     wanted = Retune(base_revision=5, tuning=tunings[2])
     assert list(retuning.due({"merge": value}, RANK_S)) == [("merge", wanted)]
     between = replace(value, revision=6, tuning=tunings[1])
@@ -137,9 +144,9 @@ def test_a_second_file_takes_back_what_the_first_one_wanted() -> None:
     """The first wish may be agreed behind the second file: until then all looks as it should."""
     files = [fleet_of(task_of(tuning=tuning)) for tuning in (FILE, replace(FILE, bonus=0.2), FILE)]
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
-    retuning = Retuning("edge1")
+    retuning = Retuning("edge1", InForce(fleet_of(task_of(tuning=FILE))))
     for old, new in itertools.pairwise(files):
-        retuning.adopt(old, new, {"merge": value}, 0.0)
+        take(retuning, old, new, {"merge": value}, 0.0)
     assert list(retuning.due({"merge": value}, 0.1)) == []
     late = replace(value, revision=6, tuning=replace(FILE, bonus=0.2))
     assert list(retuning.due({"merge": late}, 0.2)) == [("merge", Retune(base_revision=6, tuning=FILE))]
@@ -149,24 +156,24 @@ def test_a_second_file_takes_back_what_the_first_one_wanted() -> None:
 
 def test_a_revision_that_no_later_beat_confirms_silences_nobody() -> None:
     """A forged first beat told of a revision that never comes: nothing was proposed here for as long as it lived."""
-    retuning = Retuning("edge1")
+    retuning = Retuning("edge1", InForce(fleet_of(task_of(tuning=FILE))))
     old, new = fleet_of(task_of(tuning=FILE)), fleet_of(task_of(tuning=replace(FILE, bonus=0.2)))
     values = {"merge": replace(allocation_of(5, "edge1"), tuning=FILE)}
     retuning.hear("edge2", 1 << 53, 4)
-    retuning.adopt(old, new, values, 0.0)
+    take(retuning, old, new, values, 0.0)
     assert retuning.is_idle, "it may know better"
     retuning.hear("edge2", 5, 4)
-    retuning.adopt(old, new, values, 0.0)
+    take(retuning, old, new, values, 0.0)
     assert retuning.is_idle, "it has one more"
     retuning.hear("edge2", 5, 5)
-    retuning.adopt(old, new, values, 0.0)
+    take(retuning, old, new, values, 0.0)
     assert not retuning.is_idle
 
 
 def test_who_has_left_the_fleet_is_not_waited_for() -> None:
-    retuning = Retuning("edge1")
+    retuning = Retuning("edge1", InForce(fleet_of(task_of(tuning=FILE))))
     old, new = fleet_of(task_of(tuning=FILE)), fleet_of(task_of(tuning=replace(FILE, bonus=0.2)))
     values = {"merge": replace(allocation_of(5, "edge1"), tuning=FILE)}
     retuning.hear("stranger", 9, 4)
-    retuning.adopt(old, new, values, 0.0)
+    take(retuning, old, new, values, 0.0)
     assert not retuning.is_idle

@@ -9,6 +9,7 @@ import pytest
 from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.proposals import proposal_of
+from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, Proposal
 from zsched.core.vote.tally import VoteOutcome
 from zsched.core.vote.voting import Voting, vote_time
@@ -26,7 +27,7 @@ def paper(voter: str, candidate: str = "edge2", base: int = 5) -> Proposal:
 
 
 def test_a_move_opens_a_vote_and_calls_who_has_not_proposed_lately() -> None:
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     assert voting.absorb(paper("robot2"), VALUE, 10.0)
     assert voting.opened_at == 10.0
     assert not voting.absorb(paper("robot1"), VALUE, 10.1), "our own calls nobody"
@@ -36,22 +37,22 @@ def test_a_move_opens_a_vote_and_calls_who_has_not_proposed_lately() -> None:
 
 
 def test_staying_opens_nothing_and_a_stranger_to_the_vote_answers_nobody() -> None:
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     assert not voting.absorb(paper("robot2", "edge1"), VALUE, 10.0)
     assert voting.opened_at is None
     assert voting.count(VALUE, ALL, 10.0) is None
-    assert not Voting(FLEET, "edge1").absorb(paper("robot2"), VALUE, 10.0)
+    assert not Voting(InForce(FLEET), "edge1").absorb(paper("robot2"), VALUE, 10.0)
 
 
 @pytest.mark.parametrize("base", [4, 6])
 def test_another_base_leaves_no_trace(base: int) -> None:
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     assert not voting.absorb(paper("robot2", base=base), VALUE, 10.0)
     assert (voting.opened_at, voting.proposals) == (None, {})
 
 
 def test_a_majority_ends_it_and_its_voters_commit_in_turn_once() -> None:
-    voting = Voting(FLEET, "robot3")
+    voting = Voting(InForce(FLEET), "robot3")
     voting.absorb(paper("robot3"), VALUE, 10.0)
     assert voting.count(VALUE, ALL, 10.0) is None
     voting.absorb(paper("robot2"), VALUE, 10.1)
@@ -68,7 +69,7 @@ def test_a_majority_ends_it_and_its_voters_commit_in_turn_once() -> None:
 
 
 def test_what_nobody_completes_ends_with_its_time_and_old_papers_do_not_count() -> None:
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     voting.absorb(paper("robot2"), VALUE, 10.0)
     assert voting.next_deadline() == 10.0 + VOTE_S
     ended = voting.count(VALUE, ALL, 10.0 + VOTE_S)
@@ -79,7 +80,7 @@ def test_what_nobody_completes_ends_with_its_time_and_old_papers_do_not_count() 
 
 
 def test_a_learnt_value_forgets_all_but_a_commit_that_the_register_has() -> None:
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     for handed_out in (False, True):
         voting.absorb(paper("robot1"), VALUE, 10.0)
         voting.absorb(paper("robot2"), VALUE, 10.0)
@@ -95,7 +96,7 @@ def test_a_learnt_value_forgets_all_but_a_commit_that_the_register_has() -> None
 
 
 def test_who_commits_a_move_is_called_to_no_other_vote_until_that_has_ended() -> None:
-    voting = Voting(FLEET, "robot1")
+    voting = Voting(InForce(FLEET), "robot1")
     for voter in ROBOTS[:2]:
         voting.absorb(paper(voter), VALUE, 10.0)
     assert voting.count(VALUE, ALL, 10.0) is not None

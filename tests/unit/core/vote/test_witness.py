@@ -5,16 +5,18 @@ from __future__ import annotations
 import pytest
 
 from support.beats import beat_of
+from support.fleets import fleet_of
 from zsched.core.values.beat import Beat
+from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.vote.witness import ASK_ALL_S, Witness, as_seen, as_tuple
 
 ELECTORS = ("robot1", "robot2", "robot3", "robot4", "robot5")
-NODES = frozenset((*ELECTORS, "edge1"))
+NODES = fleet_of(of=(*ELECTORS, "edge1"), electors=ELECTORS)
 
 
 def witness(me: str = "robot1", votes: int = 10) -> Witness:
-    return Witness(me=me, electors=ELECTORS, nodes=NODES, incarnation=7, votes=votes, started_at=100.0)
+    return Witness(me=me, electors=ELECTORS, in_force=InForce(NODES), incarnation=7, votes=votes, started_at=100.0)
 
 
 def said(by: str, incarnation: int = 3, votes: int = 0, *seen: tuple[str, int, int]) -> Learnt:
