@@ -7,6 +7,7 @@ Times are by the wall clock of the node that wrote them. Ages are from the same 
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from collections.abc import Container, Iterable, Iterator
@@ -34,19 +35,6 @@ STAGES: Final = ("scheduler", "vote", "executor", "route", "membership", "log")
 TYPES: Final = (MOVE, *STAGES)
 TOLD: Final = ("moves", "rehearsals", "rollouts", "changes")
 """What a history has, beside whose log it is."""
-
-
-class EventsView(Struct, frozen=True, kw_only=True):
-    """Which events are shown, and how."""
-
-    task: str | None
-    since_s: float | None
-    is_following: bool
-    is_json: bool
-    node: str | None = None
-    """Only lines that name this node."""
-    types: tuple[str, ...] = ()
-    """Only these types; empty: all."""
 
 
 def subject_of(word: str) -> tuple[str | None, str | None]:
@@ -200,29 +188,6 @@ def print_lines(lines: Iterable[tuple[float, str]]) -> None:
         say(text, indent=AGE_COLUMNS)
 
 
-def show_events(door: Door, view: EventsView) -> int:
-    """Print what the log tells, the newest last; with ``is_following`` on and on until Ctrl-C."""
-    _, now, entries, cursor = read_log(door, is_moves=False)
-    since = None if view.since_s is None else now - view.since_s
-    _print([entry for entry in entries if since is None or entry["at"] >= since], view)
-    away = Away("events", "until Ctrl-C")
-    try:
-        while view.is_following:
-            time.sleep(FOLLOW_S)
-            try:
-                _, _, entries, cursor = read_log(door, is_moves=False, cursor=cursor)
-            except CliError as error:
-                if error.code != EXIT_UNREACHABLE:
-                    raise
-                away.tell(str(error))
-            else:
-                away.tell("")
-                _print(entries, view)
-    except KeyboardInterrupt:
-        pass
-    return EXIT_OK
-
-
 def read_log(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, float, list[Json], str]:
     """(node, its wall clock, entries, where they end) from ``cursor`` to the end of the log.
 
@@ -344,17 +309,51 @@ def _move_line(move: Json) -> str:
 # --- events ----------------------------------------------------------------------------------------------------------
 
 
-def _print(entries: list[Json], view: EventsView) -> None:
-    for entry in entries:
-        if view.task not in (None, entry.get("task", "")) or not (view.node is None or names(entry, view.node)):
-            continue
-        if view.types and not _is_of(entry, view.types):
-            continue
-        if view.is_json:
-            print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
-            continue
-        where = f"task={entry['task']} epoch={shown(entry.get('epoch', 0))} " if entry.get("task") else ""
-        say(f"{wall_text(entry['at'])} {entry['stage']:<10} {where}{entry['text']}", indent=4)
+def events(
+    asked: Local,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
+    since: AgeOption = None,
+    about: Annotated[
+        str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
+    ] = None,
+    types: Annotated[
+        str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
+) -> int:
+    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
+    of_task, of_node = (None, None) if about is None else subject_of(about)
+    of_types, since_s = () if types is None else types_of(types), None if since is None else duration_s(since)
+    door, away = asked.door(), Away("events", "until Ctrl-C")
+    _, now, entries, cursor = read_log(door, is_moves=False)
+    entries = [entry for entry in entries if since_s is None or entry["at"] >= now - since_s]
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            for entry in entries:
+                is_about = of_task in (None, entry.get("task", "")) and (of_node is None or names(entry, of_node))
+                if is_about and (not of_types or _is_of(entry, of_types)):
+                    _print(entry, is_json=json_)
+            if not follow:
+                break
+            time.sleep(FOLLOW_S)
+            entries = []
+            try:
+                _, _, entries, cursor = read_log(door, is_moves=False, cursor=cursor)
+            except CliError as error:
+                if error.code != EXIT_UNREACHABLE:
+                    raise
+                away.tell(str(error))
+            else:
+                away.tell("")
+    return EXIT_OK
+
+
+def _print(entry: Json, *, is_json: bool) -> None:
+    if is_json:
+        print_json({**entry, "at": wall_text(entry["at"])}, is_line=True)
+        return
+    where = f"task={entry['task']} epoch={shown(entry.get('epoch', 0))} " if entry.get("task") else ""
+    say(f"{wall_text(entry['at'])} {entry['stage']:<10} {where}{entry['text']}", indent=4)
 
 
 def _is_of(entry: Json, types: Container[str]) -> bool:
@@ -377,28 +376,3 @@ def names(entry: Json, node: str) -> bool:
 def wall_text(at: float) -> str:
     """RFC 3339 in UTC, to the millisecond."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def events(
-    asked: Local,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
-    since: AgeOption = None,
-    about: Annotated[
-        str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
-    ] = None,
-    types: Annotated[
-        str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")
-    ] = None,
-    json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
-) -> int:
-    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
-    of_task, of_node = (None, None) if about is None else subject_of(about)
-    view = EventsView(
-        task=of_task,
-        node=of_node,
-        since_s=None if since is None else duration_s(since),
-        types=() if types is None else types_of(types),
-        is_following=follow,
-        is_json=json_,
-    )
-    return show_events(asked.door(), view)

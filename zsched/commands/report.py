@@ -317,10 +317,14 @@ def told_hold(kind: str, order: Json) -> str:
     'edge1 (hard), for 2h00m, ada@robot1: lens'
     """
     words = [f"{order['node'] or 'its owner'}{' (hard)' if order['is_hard'] else ''}"] if kind == "pin" else ["paused"]
-    words += [] if order["for_s"] is None else [f"for {span(order['for_s'])}"]
-    who = order["by"] or "an unknown operator"
-    words.append(f"{who}: {order['reason']}" if order["reason"] else who)
-    return ", ".join(words)
+    return ", ".join((*words, *_asked(order)))
+
+
+def _asked(order: Json) -> list[str]:
+    """For how long an order holds, who gave it, and why."""
+    words = [] if order.get("for_s") is None else [f"for {span(order['for_s'])}"]
+    who = order.get("by") or "an unknown operator"
+    return [*words, f"{who}: {order['reason']}" if order.get("reason") else str(who)]
 
 
 def told_rollout(rollout: Json) -> str:
@@ -330,8 +334,7 @@ def told_rollout(rollout: Json) -> str:
     'edge2 first, edge1, robot1 wait, ada@robot1: new net'
     """
     first, waiting = (", ".join(rollout[key]) or "nobody" for key in ("first", "waiting"))
-    who, reason = rollout["by"] or "an unknown operator", rollout["reason"]
-    return f"{first} first, {waiting} wait, {f'{who}: {reason}' if reason else who}"
+    return ", ".join((f"{first} first, {waiting} wait", *_asked(rollout)))
 
 
 FLAGS: Final = {"drain": "drained", "ineligible": "gets nothing new", "leave": "leaving the fleet"}
@@ -344,11 +347,7 @@ def told_flag(flag: Json) -> str:
     >>> told_flag({"kind": "drain", "by": "ada@robot1", "reason": "new fan", "for_s": 7200.0})
     'drained, for 2h00m, ada@robot1: new fan'
     """
-    words = [FLAGS[str(flag["kind"])]]
-    words += [] if flag.get("for_s") is None else [f"for {span(flag['for_s'])}"]
-    who, reason = flag.get("by") or "an unknown operator", flag.get("reason")
-    words.append(f"{who}: {reason}" if reason else str(who))
-    return ", ".join(words)
+    return ", ".join((FLAGS[str(flag["kind"])], *_asked(flag)))
 
 
 def _work(page: Page, status: Json, task: Json) -> None:

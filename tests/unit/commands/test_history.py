@@ -20,8 +20,7 @@ from zsched.commands import history as verb
 from zsched.commands import history as verbs
 from zsched.commands.ask import Door
 from zsched.commands.common import CliError
-from zsched.commands.history import EventsView, subject_of, types_of
-from zsched.commands.history import show_events as events
+from zsched.commands.history import subject_of, types_of
 from zsched.commands.page import duration_s
 from zsched.core.instructions import RecordStory
 from zsched.core.scheduler.decision import decide_again, verdict_of
@@ -115,8 +114,20 @@ def history(
     return verbs.history(said, task, of_node, None if since_s is None else f"{since_s}s")
 
 
-def view(**given: Any) -> EventsView:
-    return EventsView(**{"task": None, "since_s": None, "is_following": False, "is_json": False, **given})
+def events(
+    door: Door,
+    *,
+    task: str | None = None,
+    node: str | None = None,
+    types: tuple[str, ...] = (),
+    since_s: float | None = None,
+    is_following: bool = False,
+    is_json: bool = False,
+) -> int:
+    said: Any = SimpleNamespace(door=lambda: door)
+    about = f"task/{task}" if task else f"node/{node}" if node else None
+    since = None if since_s is None else f"{since_s}s"
+    return verbs.events(said, is_following, since, about, ",".join(types) or None, is_json)
 
 
 @pytest.mark.usefixtures("pages")
@@ -146,7 +157,7 @@ def test_on_a_terminal_of_80_columns_no_line_is_longer(capsys: pytest.CaptureFix
 @pytest.mark.usefixtures("screen")
 def test_a_long_event_goes_on_in_its_next_line_on_a_terminal(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
     pages.entries = [entry("move to edge2 on revision 3: " + "committed again " * 6, 60.0)]
-    assert events(HERE, view()) == 0
+    assert events(HERE) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("2026-09-21T14:12:20.000Z vote       task=merge epoch=2 move to edge2 on")
     assert (len(lines), max(map(len, lines)) <= 80, lines[1].startswith("    ")) == (3, True, True)
@@ -165,7 +176,7 @@ def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: py
         "   50s ago  2026-09-21T14:12:30.000Z  merge epoch 2  edge2: known from before the restart",
         "   40s ago  2026-09-21T14:12:40.000Z  merge epoch 2  edge2: as it was",
     ]
-    assert events(HERE, view(types=("move",))) == 0
+    assert events(HERE, types=("move",)) == 0
     assert capsys.readouterr().out == ""
     assert history(HERE, None, is_json=True) == 0
     body = json.loads(capsys.readouterr().out)
@@ -246,19 +257,19 @@ def test_moves_of_one_task_as_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("pages")
 def test_events_of_one_task_and_of_the_last_time(capsys: pytest.CaptureFixture[str]) -> None:
-    assert events(HERE, view(task="merge", since_s=85.0)) == 0
+    assert events(HERE, task="merge", since_s=85.0) == 0
     assert capsys.readouterr().out.splitlines() == [
         "2026-09-21T14:12:00.000Z vote       task=merge epoch=2 judged",
         "2026-09-21T14:12:10.000Z vote       task=merge epoch=2 flipped",
         "2026-09-21T14:12:11.000Z vote       task=merge epoch=2 answered",
         "2026-09-21T14:12:12.000Z vote       task=merge epoch=2 answered",
     ]
-    assert events(HERE, view(is_json=True)) == 0
+    assert events(HERE, is_json=True) == 0
     found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [faults({"schema": "zsched.event/1", **one}) for one in found] == [[]] * len(found)
     told = ["a peer came", "learnt", "judged", "flipped", "answered", "answered", "learnt \x1b[2J"]
     assert [one["text"] for one in found] == told
-    assert events(HERE, view()) == 0
+    assert events(HERE) == 0
     assert "\x1b" not in capsys.readouterr().out
 
 
@@ -276,7 +287,7 @@ def test_who_follows_goes_on_where_it_was_and_outlasts_a_restart(
             raise KeyboardInterrupt
 
     monkeypatch.setattr("zsched.commands.history.time.sleep", sleep)
-    assert events(HERE, view(is_following=True)) == 0
+    assert events(HERE, is_following=True) == 0
     captured = capsys.readouterr()
     assert captured.out.count("learnt") == 2
     assert captured.out.splitlines()[-1].endswith("newer")
@@ -288,7 +299,7 @@ def test_another_machine_tells_its_moves_and_refuses_its_events(
 ) -> None:
     there = Door(socket=Path("s"), node="robot2")
     with pytest.raises(CliError, match="lies on its machine: ask there; --for node/robot2") as refused:
-        events(there, view())
+        events(there)
     assert (refused.value.code, pages.asked) == (EXIT_USAGE, [])
     assert history(there, "merge", is_json=True) == 0
     assert {request["verb"] for request in pages.asked} == {"history"}
@@ -357,7 +368,7 @@ def test_events_of_one_node_name_it_as_a_whole_word(pages: Pages, capsys: pytest
         entry("propose edge2: nothing [edge1=0.479 edge2=0.5]", 6.0),
         entry("hedge1 and edge1-b", 5.0),
     ]
-    assert events(HERE, view(node="edge1", is_json=True)) == 0
+    assert events(HERE, node="edge1", is_json=True) == 0
     told = [json.loads(line)["text"] for line in capsys.readouterr().out.splitlines()]
     assert told == ["edge1 is gone", "learnt", "propose edge2: nothing [edge1=0.479 edge2=0.5]"]
 
@@ -456,9 +467,9 @@ def test_moves_of_the_last_time_only(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_events_of_some_types_only(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
     pages.entries = [entry("a peer came", 9.0, stage="membership"), entry("learnt", 8.0, move=MOVE), entry("won", 7.0)]
-    assert events(HERE, view(types=("move",))) == 0
+    assert events(HERE, types=("move",)) == 0
     assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["learnt"]
-    assert events(HERE, view(types=("membership", "scheduler"))) == 0
+    assert events(HERE, types=("membership", "scheduler")) == 0
     assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["came"]
 
 
