@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from zsched import paths as places
 from zsched.adapters.host.operator_client import ask
 from zsched.clock import wall_s
-from zsched.commands.common import BECOME_A_NODE, CliError, Json, check_name, nearest
+from zsched.commands.common import BECOME_A_NODE, CliError, Json, check_known, check_name, nearest
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
@@ -292,9 +292,7 @@ def _through(sockets: Sequence[Path], node: str) -> Door:
         except CliError as error:
             failures.append(error)
             continue
-        names = [str(known["name"]) for known in status["nodes"]]
-        if node not in names:
-            raise CliError(EXIT_USAGE, f"fleet {status['fleet']} has no node {node!r}{nearest(node, names)}")
+        check_known(status, "node", node)
         return Door(socket=path, node=node)
     raise failures[0]
 

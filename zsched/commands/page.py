@@ -97,11 +97,6 @@ class Page:
         self.lines.append(line.rstrip())
 
 
-def counted(number: int, noun: str) -> str:
-    """``1 message``, ``2 messages``."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
 def name_room(page: int, least: int, *lengths: int) -> int:
     """Columns for the longest of some names (characters each) on a page: 20 of 100 or fewer, more of a wider one."""
     return min(max(least, *lengths), max(NAME_ROOM, page - 80))

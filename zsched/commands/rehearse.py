@@ -21,10 +21,21 @@ from zsched import paths as places
 from zsched.clock import monotonic_s, wall_s
 from zsched.commands.ask import Door, ask_door
 from zsched.commands.change import IN_FORCE_S, OrderView, Plan, asker, consent, document_text, in_force
-from zsched.commands.common import CliError, Json, ends_as_by_ctrl_c, nearest, print_json, say, told_task, warn
+from zsched.commands.common import (
+    CliError,
+    Json,
+    check_known,
+    counted,
+    ends_as_by_ctrl_c,
+    nearest,
+    print_json,
+    say,
+    told_task,
+    warn,
+)
 from zsched.commands.flags import drain_quietly, is_given_for, lift_quietly
 from zsched.commands.options import Orders
-from zsched.commands.page import Row, counted
+from zsched.commands.page import Row
 from zsched.commands.rehearse_report import SCHEMA, as_json, table
 from zsched.commands.wait import Condition, missing
 from zsched.core.rehearsal.programme import MIN_CALM_S, Do, Lift, Look, Over, Programme, Result, Sight
@@ -275,11 +286,8 @@ class Stage:
         self._view, self._order = view, order
         self._sockets = {path.stem: path for path in places.local_sockets(runtime)} if runtime.is_dir() else {}
         self.first = self._status(view.door)
+        check_known(self.first, "task", order.task)
         task = told_task(self.first, order.task)
-        if not task:
-            names = [str(one["name"]) for one in self.first["tasks"]]
-            text = f"fleet {self.first['fleet']} has no task {order.task!r}{nearest(order.task, names)}"
-            raise CliError(EXIT_USAGE, text)
         self.at = wall_s()
         self.name = time.strftime("%Y%m%d-%H%M%S", time.gmtime(self.at)) + f"-{os.getpid() % 1000:03d}"
         reason = f"rehearsal {self.name}" + (f": {view.reason}" if view.reason else "")
@@ -565,7 +573,7 @@ class Stage:
 def _told(body: Json) -> str:
     done = sum(1 for one in body["steps_done"] if not one["left_out"])
     word = "every promise was kept" if body["is_kept"] else str(body["why"])
-    return f"{counted(done, 'step')}, {word}; `zsched rehearse --show {body['id']}`"
+    return f"{counted(done, 'steps')}, {word}; `zsched rehearse --show {body['id']}`"
 
 
 def _ready(status: Json, task: str) -> set[str]:

@@ -13,8 +13,7 @@ import sys
 from pathlib import Path
 
 from zsched.adapters.host.decision_log import is_torn
-from zsched.commands.common import CliError, Json, nearest, print_json, say
-from zsched.commands.page import counted
+from zsched.commands.common import CliError, Json, counted, nearest, print_json, say
 from zsched.core.report import plain
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.explain import explained, judged_again, seen_by, without
@@ -70,7 +69,7 @@ def replay(file: Path, *, is_json: bool) -> int:
             {"schema": SCHEMA, "judged": done, "equal": True, "line": None, "was": None, "is": None, "torn": torn}
         )
     else:
-        say(f"{counted(done, 'judgement')} made again, all equal")
+        say(f"{counted(done, 'judgements')} made again, all equal")
         if torn:
             where = ", ".join(map(str, torn))
             say(f"left out, for a power cut or a full disk has torn it: line {where}")

@@ -15,9 +15,9 @@ import typer
 
 from zsched.clock import monotonic_s
 from zsched.commands.ask import Door, ask_door
-from zsched.commands.common import CliError, Json, nearest, print_json, say, warn
+from zsched.commands.common import CliError, Json, counted, nearest, print_json, say, warn
 from zsched.commands.options import Answers, AskedOption, JsonOption, Local, new_group
-from zsched.commands.page import Page, counted, since_drop, size, span
+from zsched.commands.page import Page, since_drop, size, span
 from zsched.core.route import keyexpr
 from zsched.core.values.struct import Struct, field
 from zsched.errors import AdapterError
@@ -271,7 +271,7 @@ def _print_rates(
 
 
 def _hz_text(row: Json) -> str:
-    text = f"{row['hz']:.2f} Hz, {counted(row['messages'], 'message')}"
+    text = f"{row['hz']:.2f} Hz, {counted(row['messages'], 'messages')}"
     if row["max_gap_s"] is not None:
         text += f", gaps {row['min_gap_s'] * 1000:.1f}..{row['max_gap_s'] * 1000:.1f} ms"
     return text
@@ -279,7 +279,7 @@ def _hz_text(row: Json) -> str:
 
 def _bw_text(row: Json) -> str:
     sizes = f"{size(row['min_bytes'])}..{size(row['max_bytes'])}"
-    return f"{size(round(row['bytes_per_s']))}/s, {counted(row['messages'], 'message')} of {sizes}"
+    return f"{size(round(row['bytes_per_s']))}/s, {counted(row['messages'], 'messages')} of {sizes}"
 
 
 def show_tail(view: StreamView, word: str | None) -> int:
