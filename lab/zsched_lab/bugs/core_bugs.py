@@ -1025,13 +1025,6 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_explain.py",),
     ),
     _bug(
-        "threads beside one-threaded jobs are capped with them",
-        "zsched.core.gateway.job_need",
-        " + max(need_cores - self.hz * cpu_s, 0.0)",
-        "",
-        _JOB_NEED,
-    ),
-    _bug(
         "one extreme profile makes a need that no demand may be",
         "zsched.core.gateway.demand",
         "min((known.work or 0.0) / speed_of(profile), MAX_CPU_CORES)",
@@ -1437,13 +1430,6 @@ VOTE_BUGS = (
         "is_news=node.profiler.has_news or has_deadlines",
         "is_news=node.profiler.has_news",
         ("tests/unit/core/test_node.py",),
-    ),
-    _bug(
-        "a pool of threads is taken for one thread",
-        "zsched.core.gateway.job_need",
-        "is_one_of_several = jobs.wait_s is not None and",
-        "is_one_of_several = False and",
-        ("tests/unit/core/gateway/test_job_need.py",),
     ),
     _bug(
         "what a slow core leaves undone is no need",

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from zsched.core.gateway import demand
-from zsched.core.gateway.job_need import JobNeed
 from zsched.core.gateway.sharing import Shares
 from zsched.core.scheduler import utility
 from zsched.core.scheduler.eligibility import CHAIN
@@ -47,7 +46,6 @@ SWITCHES: Final[Mapping[str, tuple[Switch, ...]]] = {
     "calm": ((demand, "CALM_S", 0.0),),
     "guess": ((demand, "UNSURE", 1.0),),
     "told-lack": ((demand, "_told", _always(None)),),
-    "one-thread": ((JobNeed, "most_cores", _always(None)),),
     "least-need": ((utility, "LEAST_NEED_RATIO", 0.0),),
     "free-room": ((utility, "SPARE", 0.005),),
     "memory-floor": ((utility, "NEARLY_FULL", 0.0),),

@@ -303,7 +303,6 @@ def _with_job(
             known.job,
             is_calm=is_calm,
             is_known_calm=is_known_calm,
-            used_cores=load.cpu_cores,
             threads=_threads(load, load.jobs),
         )
         return replace(known, job=job, is_job_old=is_old)

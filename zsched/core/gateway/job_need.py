@@ -26,8 +26,6 @@ BUSY_FROM, BUSY_TO = 0.01, 0.9
 """The part of its time that a worker is busy: beyond these nobody knows how long its queue is."""
 MOST_QUEUE_RATIO = 20.0
 """No queue makes a job's age more than this many times its own time: whatever was told, it is much too late then."""
-ONE_THREAD_CORES = 1.1
-"""Jobs that use more, as the worker's processes do, are several at a time: a thread uses one core at most."""
 
 
 class JobNeed(Struct, frozen=True):
@@ -41,24 +39,10 @@ class JobNeed(Struct, frozen=True):
     """How irregularly jobs come: their wait for each other is so many times `crowd` of their time, >= 0."""
     hz: float
     """How often they come, > 0."""
-    is_serial: bool
-    """One thread does it, so it uses at most one core at a time."""
     holds_turn: bool = False
     """Its worker is busy while it waits for other things, too, and takes the next one behind it."""
-    is_one_of_several: bool = False
-    """Several threads were seen to do jobs at a time, each its own (a service's, an author's)."""
     is_guess: bool = False
     """A job of several threads that was seen on full machines only: how long it takes alone is a guess."""
-
-    def most_cores(self, speed: float, need_cores: float) -> float | None:
-        """What the worker can use at a time on a machine of ``speed``; ``None``: any amount.
-
-        What of its ``need_cores`` is not the jobs' is that of other threads, which run beside.
-        """
-        cpu_s = self.work_s / speed
-        if not self.is_serial or cpu_s <= 0.0:
-            return None
-        return cpu_s / (cpu_s + self.other_s) + max(need_cores - self.hz * cpu_s, 0.0)
 
     def age_s(self, speed: float, free_cores: float) -> float:
         """Expected seconds from arrival to end where a job gets this many cores while it runs, at most one."""
@@ -91,25 +75,21 @@ def told_job(
     *,
     is_calm: bool,
     is_known_calm: bool = True,
-    used_cores: float | None = None,
     threads: float | None = None,
 ) -> JobNeed:
     """A job by its worker's report, on a machine of ``speed``.
 
-    ``known``: what was known before. ``used_cores``: what the worker's processes use; ``threads``: how many of its
-    threads work on a job at once, as far as that is seen. ``is_calm``: the machine was not seen without CPU to spare
-    for `CALM_S`; ``is_known_calm``: and it was looked at for so long.
+    ``known``: what was known before. ``threads``: how many of its threads work on a job at once, as far as that is
+    seen. ``is_calm``: the machine was not seen without CPU to spare for `CALM_S`; ``is_known_calm``: and it was looked
+    at for so long.
 
     A job of several threads does not tell how long it waits for a CPU, and on a full machine its whole time is no work.
     What of its time is no CPU time is a wait for other things, a GPU perhaps, where the machine had CPU to spare.
     """
-    # either figure alone may be off for a moment: the rate by a job that is longer than its window, the use by helpers
-    is_seen = min(jobs.done_hz * jobs.cpu_s, used_cores or 0.0) > ONE_THREAD_CORES
-    is_one_of_several = jobs.wait_s is not None and (is_seen or (known is not None and known.is_one_of_several))
-    is_serial, cpu_s, waits_s = not is_one_of_several, jobs.cpu_s, other_s(jobs)
+    cpu_s, waits_s = jobs.cpu_s, other_s(jobs)
     is_guess = jobs.wait_s is None and not (is_calm and is_known_calm) and (known is None or known.is_guess)
     if jobs.wait_s is None:
-        is_serial, cpu_s = False, _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
+        cpu_s = _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
         if is_guess:  # alone they would share its work
             cpu_s = min(cpu_s, jobs.cpu_s / max(threads or 1.0, 1.0))
         waits_s = _for_others(jobs.time_s - cpu_s, known, is_calm=is_calm)
@@ -124,9 +104,7 @@ def told_job(
         other_s=waits_s,
         queueing=queueing,
         hz=max(jobs.wanted_hz, jobs.done_hz),
-        is_serial=is_serial,
         holds_turn=True,
-        is_one_of_several=is_one_of_several,
         is_guess=is_guess,
     )
 

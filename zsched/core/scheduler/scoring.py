@@ -242,11 +242,10 @@ class _View:
         is_outranked = others != () and any(other.priority > spec.priority for other in others)
         # it gets at least this if it needs it, however full the machine is
         fair = 0.0 if is_outranked else self._gateway.shares.at(spec.name, profile, need, coming)
-        free, most, is_owner = left + need, None, profile.node == self._allocation.owner
+        free, is_owner = left + need, profile.node == self._allocation.owner
         share = spare_factor(left, profile.cpu_cores, spec.cpu_floor_ratio)
         if self._job is not None:
             speed = speed_of(profile)
-            most = self._job.most_cores(speed, need)
             if deadline_ms is not None:
                 seen_s = demands.seen_s(spec.name, profile, self._now) if is_owner else 0.0
                 # a job gets that while it runs; between its jobs a task uses nothing, so that may be far more
@@ -254,9 +253,9 @@ class _View:
                 share *= timely_worth(on_time(job_s, deadline_ms / 1e3))
         load = profile.worker(spec.name) if is_owner else None
         if load is not None and is_short(load):  # what such an owner gives is measured
-            worth = service_utility(free, need, profile.cpu_cores, least=min(fair, own), most=most, share=share)
+            worth = service_utility(free, need, profile.cpu_cores, least=min(fair, own), share=share)
             return min(worth, demands.given_ratio(spec.name, profile, self._now))
-        return service_utility(free, need, profile.cpu_cores, least=fair, most=most, share=share)
+        return service_utility(free, need, profile.cpu_cores, least=fair, share=share)
 
     def _link(self, candidate: NodeId, profile: Profile) -> PairLink | None:
         if candidate == self._owner:

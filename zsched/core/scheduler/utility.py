@@ -78,9 +78,7 @@ SPARE = 0.02
 CPU and memory together, so a task that lacks nothing does not move for more room."""
 
 
-def service_utility(
-    free: float, demand: float, capacity: float, *, least: float = 0.0, most: float | None = None, share: float = 1.0
-) -> float:
+def service_utility(free: float, demand: float, capacity: float, *, least: float = 0.0, share: float = 1.0) -> float:
     """The share of its work that a task would get done, ``min(free / demand, 1)``, and a little for what is left free.
 
     Args:
@@ -89,7 +87,6 @@ def service_utility(
         demand: of the task, in the same unit, >= 0.
         capacity: of the machine, in the same unit, > 0.
         least: what the task gets there if it needs it, however little is free, in the same unit, >= 0.
-        most: what the task can use there at a time, however much is free; ``None``: any amount.
         share: what counts of that share of its work, in [0, 1]: less where it got less than was foreseen, or gets it
             too late (`on_time`).
 
@@ -99,15 +96,11 @@ def service_utility(
     1.0
     >>> round(service_utility(free=0.0, demand=0.1, capacity=16.0, least=0.9), 4)
     0.9801
-    >>> round(service_utility(free=4.0, demand=2.0, capacity=4.0, most=1.0), 4)
-    0.51
     """
     room = clamp(free / max(demand, LEAST_NEED_RATIO * capacity))
     if room < 1.0 and demand > 0.0:
         # By the need itself: a small task that gets all that it needs lacks as little on a large machine.
         room, free = clamp(max(room, least / demand)), max(free, min(least, demand))
-    if most is not None and most < demand:
-        room = min(room, most / demand)
     return (1.0 - SPARE) * share * room + SPARE * clamp(free / capacity)
 
 

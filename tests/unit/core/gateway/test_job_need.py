@@ -48,24 +48,8 @@ def test_a_serial_worker_is_busy_while_its_job_waits_for_other_things_as_well() 
     assert job.age_s(2.0, 4.0) == pytest.approx(0.075 * (1.0 + crowd(0.375)))
 
 
-def test_jobs_that_several_threads_do_at_a_time_may_use_several_cores() -> None:
-    """Each thread by itself tells how long it waited for a CPU; their jobs together are no single thread's."""
-    four = Jobs(time_s=0.1, cpu_s=0.1, wait_s=0.0, done_hz=25.0, wanted_hz=25.0)
-    job = told_job(four, 1.0, None, is_calm=True, used_cores=2.5)
-    assert job.most_cores(1.0, 2.5) is None
-    starved = replace(four, time_s=0.4, wait_s=0.3, done_hz=6.0)
-    assert told_job(starved, 1.0, job, is_calm=False, used_cores=0.6).most_cores(1.0, 2.5) is None, "it stays known"
-    assert told_job(starved, 1.0, None, is_calm=False, used_cores=0.6).most_cores(1.0, 0.5) == pytest.approx(1.0)
-    of_helpers = told_job(replace(four, wait_s=None), 1.0, job, is_calm=True, used_cores=2.5)
-    assert not of_helpers.is_one_of_several
-    for one in (replace(four, done_hz=5.0), replace(four, cpu_s=0.04)):
-        assert told_job(one, 1.0, None, is_calm=True, used_cores=2.5).is_serial, "helpers that do no jobs use it"
-    long = replace(four, time_s=5.0, cpu_s=5.0, done_hz=1.0)
-    assert told_job(long, 1.0, None, is_calm=True, used_cores=1.0).is_serial, "a job that is longer than the window"
-
-
 def test_a_queue_under_a_load_is_at_most_the_usual_one() -> None:
-    usual = JobNeed(work_s=0.1, other_s=0.0, queueing=1.0, hz=5.0, is_serial=True)
+    usual = JobNeed(work_s=0.1, other_s=0.0, queueing=1.0, hz=5.0)
 
     def seen(age_s: float) -> float:
         jobs = Jobs(time_s=0.2, cpu_s=0.1, wait_s=0.1, age_s=age_s, done_hz=5.0, wanted_hz=5.0)
@@ -109,7 +93,7 @@ def test_a_job_of_several_threads_that_waits_for_a_gpu_waits_as_long_on_every_ma
     """0.15 s of 0.2 s were neither work nor a wait, so every machine promised 0.05 s, and none kept it."""
     jobs = Jobs(time_s=0.2, cpu_s=0.05, age_s=0.2, done_hz=4.0, wanted_hz=4.0)
     job = told_job(jobs, 1.0, None, is_calm=True)
-    assert (job.work_s, job.other_s, job.most_cores(1.0, 0.2)) == pytest.approx((0.05, 0.15, None))
+    assert (job.work_s, job.other_s) == pytest.approx((0.05, 0.15))
     assert job.age_s(1.0, 4.0) == pytest.approx(0.2), "as it was seen there"
     assert job.age_s(0.5, 4.0) == pytest.approx(0.25)
     queued = told_job(replace(jobs, age_s=0.3), 1.0, None, is_calm=True)
@@ -117,15 +101,6 @@ def test_a_job_of_several_threads_that_waits_for_a_gpu_waits_as_long_on_every_ma
     late = told_job(replace(jobs, time_s=0.35, age_s=0.35), 1.0, job, is_calm=False)
     assert (late.work_s, late.other_s) == pytest.approx((0.05, 0.15)), "more than that may be a wait for a CPU"
     assert told_job(jobs, 1.0, None, is_calm=False).other_s == 0.0
-
-
-def test_what_runs_beside_the_jobs_is_no_part_of_their_one_thread() -> None:
-    """0.8 cores of jobs and 0.45 beside them lack nothing on a machine that has 1.25."""
-    jobs = Jobs(time_s=0.05, cpu_s=0.05, wait_s=0.0, age_s=0.05, done_hz=16.0, wanted_hz=16.0)
-    job = told_job(jobs, 1.0, None, is_calm=True)
-    assert job.most_cores(1.0, 1.25) == pytest.approx(1.45)
-    assert job.most_cores(1.0, 0.8) == pytest.approx(1.0)
-    assert job.most_cores(0.5, 1.6) == pytest.approx(1.0), "more of them than one thread can do is left undone"
 
 
 @pytest.mark.parametrize("time_s", [1e-9, 1e-3])
