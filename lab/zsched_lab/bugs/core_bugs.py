@@ -1139,7 +1139,7 @@ VOTE_BUGS = (
     _bug(
         "a load that comes is a promise that was not kept",
         "zsched.core.scheduler.kept",
-        "(max if now - self.since >= SETTLE_S else min)(gave, before[1])",
+        "(max if now - self.since >= RISES_S else min)(gave, before[1])",
         "min(gave, before[1])",
         ("tests/unit/core/scheduler/test_kept.py",),
     ),

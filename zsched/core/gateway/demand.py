@@ -23,12 +23,10 @@ from zsched.core.values.struct import Struct, replace
 
 UNSURE = 1.5
 """Need of a worker that always wants to run and never had enough: this many times its use."""
-SETTLE_S = 4.0
-"""After a move, or a worker's start, the smoothed use rises for so long: it is only a lower bound of the need."""
 SHOWS_S: Final = 0.5
 """By this time constant a machine's figures show a task that has come: that of their means, and their way here."""
 HOLDS_ALL_S: Final = 60.0
-"""After so long with its task a worker has taken the memory that it works with."""
+"""After so long with its task a worker has taken the memory that it works with; until then the known figure counts."""
 
 
 class _Known(Struct, frozen=True):
@@ -105,46 +103,42 @@ class Demands:
             self._known[task] = known
             return False
         found = replace(known, full_at=now) if is_full(profile) else known
-        is_new, is_calm = now - found.since < SETTLE_S, now - found.full_at > CALM_S
+        is_calm = now - found.full_at > CALM_S
         if load.memory_mb is not None:
+            is_new = now - found.since < HOLDS_ALL_S
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         speed = speed_of(profile)
         if load.cpu_cores is not None:
             is_starved = is_full(profile) and not _gets_all(load, load.cpu_cores)
             fastest = max(fastest or speed, speed)
-            found = _with_use(
-                found, load, load.cpu_cores, speed, fastest, is_new=is_new, is_starved=is_starved, is_calm=is_calm
-            )
+            found = _with_use(found, load, load.cpu_cores, speed, fastest, is_starved=is_starved, is_calm=is_calm)
         is_known_calm = is_calm and now - found.since > CALM_S
-        self._known[task] = found = _with_job(
-            found, load, speed, is_new=is_new, is_calm=is_calm, is_known_calm=is_known_calm
-        )
+        self._known[task] = found = _with_job(found, load, speed, is_calm=is_calm, is_known_calm=is_known_calm)
         return (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
-    def given_ratio(self, task: TaskId, profile: Profile, now: float) -> float:
+    def given_ratio(self, task: TaskId, profile: Profile) -> float:
         """The part of its need that a task is seen to get where it is, in [0, 1].
 
-        1 where nothing shows that it lacks anything, and where its use still rises.
+        1 where nothing shows that it lacks anything.
         """
-        load, work = self._settled(task, profile, now), self._known.get(task, _NOTHING).work
+        load, work = self._there(task, profile), self._known.get(task, _NOTHING).work
         if not work or load is None or load.cpu_cores is None or not (shows_lack(load) and is_short(load)):
             return 1.0
         return min(load.cpu_cores * speed_of(profile) / work, 1.0)
 
-    def seen_s(self, task: TaskId, profile: Profile, now: float) -> float:
-        """How long a task's jobs are seen to take on a full machine where it is; 0 elsewhere, and just after it came.
+    def seen_s(self, task: TaskId, profile: Profile) -> float:
+        """How long a task's jobs are seen to take on a full machine where it is; 0 elsewhere.
 
         Where a load has ended the jobs that it held up count in their mean for some seconds.
         """
-        load = self._settled(task, profile, now)
+        load = self._there(task, profile)
         if load is None or load.jobs is None or not is_full(profile):
             return 0.0
         return load.jobs.time_s if load.jobs.age_s is None else load.jobs.age_s
 
-    def _settled(self, task: TaskId, profile: Profile, now: float) -> WorkerLoad | None:
-        """The task's worker where its use has risen since it came; ``None``: elsewhere, or it still rises."""
-        known = self._known.get(task, _NOTHING)
-        return profile.worker(task) if known.owner == profile.node and now - known.since >= SETTLE_S else None
+    def _there(self, task: TaskId, profile: Profile) -> WorkerLoad | None:
+        """The task's worker where it was seen last; ``None`` elsewhere."""
+        return profile.worker(task) if self._known.get(task, _NOTHING).owner == profile.node else None
 
     def note_unplaced(self, task: TaskId) -> None:
         """Nobody has the task: who gets it next will not show it at once."""
@@ -229,7 +223,6 @@ def _with_use(
     speed: float,
     fastest: float,
     *,
-    is_new: bool,
     is_starved: bool,
     is_calm: bool,
 ) -> _Known:
@@ -237,11 +230,11 @@ def _with_use(
     use, most = cores * speed, (load.wanted_cores or 0.0) * speed
     told, least = _told(load, speed, fastest, is_calm=is_calm), max(use, known.work or 0.0)
     is_held = known.is_sure and known.work == least
-    if told is not None and not known.is_sure and (most > use or is_new or is_starved):
-        return replace(known, work=max(told, known.work or 0.0) if is_new else told)
+    if told is not None and not known.is_sure and (most > use or is_starved):
+        return replace(known, work=told)
     if most > use and not (is_held and least <= most):
         return replace(known, work=min(UNSURE * use, most), is_sure=False)
-    if most > use or is_new or is_starved:
+    if most > use or is_starved:
         return replace(known, work=least, is_sure=is_held)
     if is_calm and told is not None and told > use and is_short(load):
         # a worker that waits for other things, too, or whose threads take turns, never always wants to run, and quicker
@@ -288,9 +281,7 @@ def _threads(load: WorkerLoad, jobs: Jobs) -> float | None:
     return load.wanted_cores
 
 
-def _with_job(
-    known: _Known, load: WorkerLoad, speed: float, *, is_new: bool, is_calm: bool, is_known_calm: bool
-) -> _Known:
+def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_calm: bool, is_known_calm: bool) -> _Known:
     """With the job of the owner's worker: the one that it reports, or reported before it became silent.
 
     The job of a program that has been replaced says nothing of the one that runs now and reports none.
@@ -308,4 +299,4 @@ def _with_job(
         return replace(known, job=job, is_job_old=is_old)
     if is_old:
         return replace(known, is_job_old=True)
-    return replace(known, job=None, is_job_old=False) if known.is_job_old and not is_new else known
+    return replace(known, job=None, is_job_old=False) if known.is_job_old else known

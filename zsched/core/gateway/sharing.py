@@ -15,7 +15,6 @@ from collections.abc import Container
 from typing import Final, Self
 
 from zsched.core.gateway.company import STARVED_CPU_RATIO, is_full, others_cores
-from zsched.core.gateway.demand import SETTLE_S
 from zsched.core.gateway.job_need import CALM_WAIT_RATIO
 from zsched.core.gateway.shortfall import is_short
 from zsched.core.values.model import NodeId, TaskId
@@ -25,7 +24,7 @@ from zsched.core.values.struct import Struct, replace
 ENDED_S: Final = 60.0
 """Others that do not fill a machine any more for this time have ended."""
 COUNTED_S: Final = 8.0
-"""The threads that came with a task are counted for so long, once they show (`SETTLE_S`); later ones are others'."""
+"""The threads that came with a task are counted for so long; later ones are others'."""
 LEFT_S: Final = 4.0
 """Others show what they do without the task for this time after its worker has stopped working there."""
 
@@ -73,7 +72,7 @@ class _Unmeasured(Struct, frozen=True):
     def look(self, runnable: float, now: float) -> Self:
         """With one more figure of the machine."""
         found = self if self.left_at is None else replace(self, left_at=None)
-        if self.others is None or not SETTLE_S <= now - self.since < SETTLE_S + COUNTED_S:
+        if self.others is None or now - self.since >= COUNTED_S:
             return found
         more, looks = max(runnable - self.others, 0.0), self.looks + 1
         return replace(found, own=((self.own or 0.0) * self.looks + more) / looks, looks=looks)

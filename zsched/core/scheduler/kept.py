@@ -15,13 +15,14 @@ import math
 from collections.abc import Container, Mapping
 from typing import Final, Self
 
-from zsched.core.gateway.demand import SETTLE_S
 from zsched.core.values.decision import KeptMemory
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field
 
 SAME_WORTH: Final = 0.1
 """A promise is the same as long as it differs by at most this."""
+RISES_S: Final = 4.0
+"""For so long a task's use may rise where it has come, and the machine seem to give more than it will."""
 LEASELESS_S: Final = 60.0
 """A machine that had no lease for an exclusive task is not judged anew for so long."""
 
@@ -74,7 +75,7 @@ class Kept(Struct):
         if owner is not None and owner in worth and owner in self.foretold:
             gave, before = worth[owner], self.seen.get(owner)
             if before is not None:
-                gave = (max if now - self.since >= SETTLE_S else min)(gave, before[1])
+                gave = (max if now - self.since >= RISES_S else min)(gave, before[1])
             if before is None or before[2] <= now:
                 self.seen[owner] = (self.foretold[owner], gave, now)
         self.foretold |= {name: value for name, value in worth.items() if name != owner or name not in self.foretold}

@@ -247,14 +247,14 @@ class _View:
         if self._job is not None:
             speed = speed_of(profile)
             if deadline_ms is not None:
-                seen_s = demands.seen_s(spec.name, profile, self._now) if is_owner else 0.0
+                seen_s = demands.seen_s(spec.name, profile) if is_owner else 0.0
                 # a job gets that while it runs; between its jobs a task uses nothing, so that may be far more
                 job_s = max(self._job.age_s(speed, max(free, fair)), seen_s) + network_s
                 share *= timely_worth(on_time(job_s, deadline_ms / 1e3))
         load = profile.worker(spec.name) if is_owner else None
         if load is not None and is_short(load):  # what such an owner gives is measured
             worth = service_utility(free, need, profile.cpu_cores, least=min(fair, own), share=share)
-            return min(worth, demands.given_ratio(spec.name, profile, self._now))
+            return min(worth, demands.given_ratio(spec.name, profile))
         return service_utility(free, need, profile.cpu_cores, least=fair, share=share)
 
     def _link(self, candidate: NodeId, profile: Profile) -> PairLink | None:

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.profiles import load_of, profile_of
-from zsched.core.gateway.demand import SETTLE_S
 from zsched.core.gateway.sharing import COUNTED_S, ENDED_S, LEFT_S, Shares, fair_share
 from zsched.core.values.profile import Jobs, Profile, WorkerLoad, WorkerState
 
@@ -235,7 +234,7 @@ def come(shares: Shares, *, others: float | None, runnable: float, state: Worker
     """It is elsewhere until 0 s, and from then on here."""
     if others is not None:
         shares.look_elsewhere("merge", unmeasured(others), -1.0)
-    for at in range(round(SETTLE_S + COUNTED_S) + 5):
+    for at in range(round(COUNTED_S) + 5):
         shares.learn("merge", unmeasured(runnable, state=state), float(at))
 
 
@@ -251,16 +250,13 @@ def test_its_threads_are_those_that_came_with_it(state: WorkerState | None) -> N
     assert shares.beside_unmeasured("merge", unmeasured(6.0, node="edge2"), 2.0) == (2.0, 4.0), "it is not there"
 
 
-def test_until_they_show_others_are_no_more_than_before() -> None:
+def test_its_threads_are_counted_for_some_seconds_on_the_mean() -> None:
     shares = Shares()
     shares.look_elsewhere("merge", unmeasured(1.0), -1.0)
-    assert not shares.learn("merge", unmeasured(6.0), 0.0)
-    assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 1.0)
-    assert not shares.learn("merge", unmeasured(6.0), SETTLE_S - 0.1)
-    assert shares.learn("merge", unmeasured(6.0), SETTLE_S)
-    assert shares.learn("merge", unmeasured(4.0), SETTLE_S + 1.0)
+    assert shares.learn("merge", unmeasured(6.0), 0.0)
+    assert shares.learn("merge", unmeasured(4.0), 1.0)
     assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (4.0, 2.0), "on the mean"
-    assert not shares.learn("merge", unmeasured(1.0), SETTLE_S + COUNTED_S)
+    assert not shares.learn("merge", unmeasured(1.0), COUNTED_S)
 
 
 def test_of_a_machine_that_was_not_seen_before_all_but_the_need_is_others() -> None:

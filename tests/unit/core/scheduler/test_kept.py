@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.gateway.demand import SETTLE_S
-from zsched.core.scheduler.kept import LEASELESS_S, SAME_WORTH, Kept
+from zsched.core.scheduler.kept import LEASELESS_S, RISES_S, SAME_WORTH, Kept
 
 MEMORY_S = 1000.0
 HOME = {"edge1": 0.6, "edge2": 0.9}
@@ -45,9 +44,9 @@ def test_another_promise_is_another_chance() -> None:
 
 
 def test_the_newest_figure_counts_while_the_use_still_rises_and_then_the_best() -> None:
-    assert worth_of_edge2(gave((1.5, 0.9), (1.0 + SETTLE_S - 0.1, 0.5)), 5.0) == pytest.approx(0.5, abs=0.01)
-    settled = gave((1.0 + SETTLE_S, 0.85), (2.0 + SETTLE_S, 0.5))
-    assert worth_of_edge2(settled, 2.0 + SETTLE_S) == pytest.approx(0.85, abs=0.01), "a load that came is not its doing"
+    assert worth_of_edge2(gave((1.5, 0.9), (1.0 + RISES_S - 0.1, 0.5)), 5.0) == pytest.approx(0.5, abs=0.01)
+    settled = gave((1.0 + RISES_S, 0.85), (2.0 + RISES_S, 0.5))
+    assert worth_of_edge2(settled, 2.0 + RISES_S) == pytest.approx(0.85, abs=0.01), "a load that came is not its doing"
 
 
 def test_a_robot_that_has_just_started_holds_nothing_against_an_owner() -> None:
@@ -61,12 +60,12 @@ def test_each_stay_is_judged_anew() -> None:
     kept = gave((1.5, 0.5))
     look(kept, {"edge1": 0.6, "edge2": 0.88}, "edge2", 101.0)
     assert worth_of_edge2(kept, 101.0) == pytest.approx(0.5), "not by its first moment"
-    look(kept, {"edge1": 0.6, "edge2": 0.88}, "edge2", 101.0 + SETTLE_S)
-    assert worth_of_edge2(kept, 101.0 + SETTLE_S) == pytest.approx(0.88)
+    look(kept, {"edge1": 0.6, "edge2": 0.88}, "edge2", 101.0 + RISES_S)
+    assert worth_of_edge2(kept, 101.0 + RISES_S) == pytest.approx(0.88)
 
 
 def test_one_that_fails_again_soon_gave_half_of_that() -> None:
-    kept = gave((1.0 + SETTLE_S, 0.9))
+    kept = gave((1.0 + RISES_S, 0.9))
     for times in (1, 2, 3):
         kept.fail("edge2", 100.0)
         assert worth_of_edge2(kept, 100.0) == pytest.approx(0.9 / 2**times)
@@ -101,7 +100,7 @@ def test_a_machine_that_failed_counts_as_half_of_what_it_promised_and_again_half
 
 def test_what_a_machine_gives_again_is_kept_anew_however_short_the_stay() -> None:
     """It was tried again and again once the first record had faded: 58 moves in ten minutes."""
-    kept = gave((1.0 + SETTLE_S, 0.5))
+    kept = gave((1.0 + RISES_S, 0.5))
     for at in (2000.0, 4000.0, 6000.0):
         assert worth_of_edge2(kept, at) > 0.7, "it has faded"
         look(kept, {"edge1": 0.6, "edge2": 0.5}, "edge2", at)
@@ -110,7 +109,7 @@ def test_what_a_machine_gives_again_is_kept_anew_however_short_the_stay() -> Non
 
 
 def test_a_machine_without_a_lease_is_not_judged_anew_for_a_minute() -> None:
-    kept = gave((1.0 + SETTLE_S, 0.9))
+    kept = gave((1.0 + RISES_S, 0.9))
     kept.fail("edge2", 100.0, LEASELESS_S)
     assert (kept.has_failed("edge2", 159.0), kept.has_failed("edge2", 161.0)) == (True, False)
     for at in (101.0, 150.0):
