@@ -42,7 +42,6 @@ SWITCHES: Final[Mapping[str, tuple[Switch, ...]]] = {
     "seen-age": ((demand.Demands, "seen_s", _always(0.0)),),
     "fair-share": ((Shares, "at", _always(0.0)),),
     "kept-share": ((Shares, "at", _at_without_experience),),
-    "calm": ((demand, "CALM_S", 0.0),),
     "guess": ((demand, "UNSURE", 1.0),),
     "told-lack": ((demand, "_told", _always(None)),),
     "least-need": ((utility, "LEAST_NEED_RATIO", 0.0),),

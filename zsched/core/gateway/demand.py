@@ -14,7 +14,7 @@ import math
 from typing import Final
 
 from zsched.core.gateway.company import is_full
-from zsched.core.gateway.job_need import CALM_S, JobNeed, other_s, told_job
+from zsched.core.gateway.job_need import JobNeed, other_s, told_job
 from zsched.core.gateway.shortfall import SHORT_RATIO, is_short, shows_lack
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
@@ -51,8 +51,6 @@ class _Known(Struct, frozen=True):
     owner: NodeId | None = None
     since: float = 0.0
     """When it was first looked at there, with its worker ready."""
-    full_at: float = -math.inf
-    """When the owner's machine last had no CPU to spare."""
 
 
 _NOTHING: Final = _Known()
@@ -102,18 +100,16 @@ class Demands:
         if profile.cpu_used_cores is None:  # it is there, and shows by its memory, and says nothing of its need
             self._known[task] = known
             return False
-        found = replace(known, full_at=now) if is_full(profile) else known
-        is_calm = now - found.full_at > CALM_S
+        found, is_calm = known, not is_full(profile)
         if load.memory_mb is not None:
             is_new = now - found.since < HOLDS_ALL_S
             found = replace(found, memory_mb=max(load.memory_mb, (known.memory_mb or 0.0) if is_new else 0.0))
         speed = speed_of(profile)
         if load.cpu_cores is not None:
-            is_starved = is_full(profile) and not _gets_all(load, load.cpu_cores)
+            is_starved = not is_calm and not _gets_all(load, load.cpu_cores)
             fastest = max(fastest or speed, speed)
             found = _with_use(found, load, load.cpu_cores, speed, fastest, is_starved=is_starved, is_calm=is_calm)
-        is_known_calm = is_calm and now - found.since > CALM_S
-        self._known[task] = found = _with_job(found, load, speed, is_calm=is_calm, is_known_calm=is_known_calm)
+        self._known[task] = found = _with_job(found, load, speed, is_calm=is_calm)
         return (found.work, found.memory_mb, found.job) != (known.work, known.memory_mb, known.job)
 
     def given_ratio(self, task: TaskId, profile: Profile) -> float:
@@ -197,8 +193,7 @@ class Demands:
 def _came(known: _Known, node: NodeId, now: float) -> _Known:
     """It begins to be seen on a node: another one than before, or the same one, where its worker has started again."""
     has_come = known.is_unplaced or known.seen_at not in (None, node)
-    found = replace(known, owner=node, since=now, has_come=has_come, seen_at=node)
-    return replace(found, full_at=-math.inf, is_unplaced=False)
+    return replace(known, owner=node, since=now, has_come=has_come, seen_at=node, is_unplaced=False)
 
 
 def speed_of(profile: Profile) -> float:
@@ -236,11 +231,17 @@ def _with_use(
         return replace(known, work=min(UNSURE * use, most), is_sure=False)
     if most > use or is_starved:
         return replace(known, work=least, is_sure=is_held)
-    if is_calm and told is not None and told > use and is_short(load):
+    if is_calm and told is not None and told > use and _leaves_undone(load):
         # a worker that waits for other things, too, or whose threads take turns, never always wants to run, and quicker
-        # cores would do more; what a load held up is undone for some seconds behind its end
+        # cores would do more
         return replace(known, work=told, is_sure=False)
     return replace(known, work=use, is_sure=True)
+
+
+def _leaves_undone(load: WorkerLoad) -> bool:
+    """Whether it leaves work undone now: means that tell of more work than it uses are of before."""
+    jobs = load.jobs
+    return is_short(load) and jobs is not None and (load.cpu_cores or 0.0) >= SHORT_RATIO * jobs.done_hz * jobs.cpu_s
 
 
 def _told(load: WorkerLoad, speed: float, fastest: float, *, is_calm: bool) -> float | None:
@@ -281,7 +282,7 @@ def _threads(load: WorkerLoad, jobs: Jobs) -> float | None:
     return load.wanted_cores
 
 
-def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_calm: bool, is_known_calm: bool) -> _Known:
+def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_calm: bool) -> _Known:
     """With the job of the owner's worker: the one that it reports, or reported before it became silent.
 
     The job of a program that has been replaced says nothing of the one that runs now and reports none.
@@ -293,7 +294,6 @@ def _with_job(known: _Known, load: WorkerLoad, speed: float, *, is_calm: bool, i
             speed,
             known.job,
             is_calm=is_calm,
-            is_known_calm=is_known_calm,
             threads=_threads(load, load.jobs),
         )
         return replace(known, job=job, is_job_old=is_old)

@@ -20,8 +20,6 @@ RANDOM_QUEUEING = 1.0
 """Until it was seen, jobs count as coming at random."""
 LEAST_FREE_CORES = 0.05
 """A job on a full machine gets at least this much, so that its time is finite."""
-CALM_S = 6.0
-"""For so long the machine must have had CPU to spare: answers' time is a mean that follows later than the machine's."""
 BUSY_FROM, BUSY_TO = 0.01, 0.9
 """The part of its time that a worker is busy: beyond these nobody knows how long its queue is."""
 MOST_QUEUE_RATIO = 20.0
@@ -74,20 +72,18 @@ def told_job(
     known: JobNeed | None,
     *,
     is_calm: bool,
-    is_known_calm: bool = True,
     threads: float | None = None,
 ) -> JobNeed:
     """A job by its worker's report, on a machine of ``speed``.
 
     ``known``: what was known before. ``threads``: how many of its threads work on a job at once, as far as that is
-    seen. ``is_calm``: the machine was not seen without CPU to spare for `CALM_S`; ``is_known_calm``: and it was looked
-    at for so long.
+    seen. ``is_calm``: the machine has CPU to spare.
 
     A job of several threads does not tell how long it waits for a CPU, and on a full machine its whole time is no work.
     What of its time is no CPU time is a wait for other things, a GPU perhaps, where the machine had CPU to spare.
     """
     cpu_s, waits_s = jobs.cpu_s, other_s(jobs)
-    is_guess = jobs.wait_s is None and not (is_calm and is_known_calm) and (known is None or known.is_guess)
+    is_guess = jobs.wait_s is None and not is_calm and (known is None or known.is_guess)
     if jobs.wait_s is None:
         cpu_s = _at_once(jobs.cpu_s, jobs.time_s, speed, known, is_calm=is_calm)
         if is_guess:  # alone they would share its work

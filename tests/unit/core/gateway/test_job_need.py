@@ -60,19 +60,17 @@ def test_a_queue_under_a_load_is_at_most_the_usual_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("is_calm", "is_known_calm", "work_s"),
-    [(False, False, 0.1), (True, False, 0.1), (False, True, 0.1), (True, True, 0.25)],
+    ("is_calm", "work_s"),
+    [(False, 0.1), (True, 0.25)],
 )
-def test_how_long_a_job_takes_alone_is_a_guess_until_it_was_seen_alone_for_a_while(
-    is_calm: bool, is_known_calm: bool, work_s: float
-) -> None:
-    """Four threads, 0.4 s of CPU a job. The first figures of a full machine do not show yet that it is."""
+def test_how_long_a_job_takes_alone_is_a_guess_until_it_was_seen_alone(is_calm: bool, work_s: float) -> None:
+    """Four threads, 0.4 s of CPU a job."""
     jobs = Jobs(time_s=0.25, cpu_s=0.4, age_s=0.25, done_hz=2.0, wanted_hz=2.0)
-    job = told_job(jobs, 1.0, None, is_calm=is_calm, is_known_calm=is_known_calm, threads=4.0)
+    job = told_job(jobs, 1.0, None, is_calm=is_calm, threads=4.0)
     assert job.work_s == pytest.approx(work_s)
     assert job.is_guess is (work_s == 0.1)
-    assert told_job(jobs, 1.0, job, is_calm=False, is_known_calm=False).is_guess is job.is_guess
-    assert told_job(jobs, 1.0, None, is_calm=False, is_known_calm=False, threads=0.5).work_s == pytest.approx(0.25)
+    assert told_job(jobs, 1.0, job, is_calm=False).is_guess is job.is_guess
+    assert told_job(jobs, 1.0, None, is_calm=False, threads=0.5).work_s == pytest.approx(0.25)
 
 
 def test_how_irregularly_jobs_of_several_threads_come_is_seen_anew_on_every_calm_machine() -> None:
