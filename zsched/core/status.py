@@ -11,8 +11,7 @@ from collections.abc import Iterable, Iterator
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.rhythm import HUNG_TIMES
 from zsched.core.executor.rollouts import waiting
-from zsched.core.gateway.company import is_full
-from zsched.core.gateway.shortfall import is_short
+from zsched.core.gateway.shortfall import is_full, is_short
 from zsched.core.route.rates import STALE_S
 from zsched.core.scheduler.eligibility import OF_MACHINE, may_get
 from zsched.core.scheduler.judge import by, preferred

@@ -1088,13 +1088,6 @@ VOTE_BUGS = (
         ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
     ),
     _bug(
-        "what a task gets between its pauses is forgotten",
-        "zsched.core.gateway.sharing",
-        "not (_is_hungry(load) or _is_held_up(profile, load))",
-        "not _is_hungry(load)",
-        ("tests/unit/core/gateway/test_sharing.py", "tests/unit/core/test_closed_loop.py"),
-    ),
-    _bug(
         "what a machine did not keep is forgotten when the task leaves",
         "zsched.core.scheduler.kept",
         "found[name] -= (promised - gave) * 0.5 ** (max(now - at, 0.0) / memory_s)",
@@ -1177,13 +1170,6 @@ VOTE_BUGS = (
         "unshown = 1.0 if other.worker.command else gateway",
         "unshown = 1.0 if other.worker is not None else gateway",
         ("tests/unit/core/scheduler/test_bookings.py",),
-    ),
-    _bug(
-        "a crowd that has ended holds a task's share down",
-        "zsched.core.gateway.sharing",
-        "if calm_at is not None and now - calm_at > ENDED_S:",
-        "if calm_at is not None and now < calm_at:",
-        ("tests/unit/core/gateway/test_sharing.py",),
     ),
     _bug(
         "a need is kept for as long as the machine is full",

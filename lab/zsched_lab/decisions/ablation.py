@@ -30,7 +30,7 @@ def _always(value: object) -> Callable[..., object]:
 
 def _at_without_experience(shares: Shares, *given: Any) -> float:
     """A fair share that is believed wherever the task has been."""
-    getattr(shares, "_got").clear()  # noqa: B009 - the study reaches into the product here, and nowhere else
+    getattr(shares, "_kept").clear()  # noqa: B009 - the study reaches into the product here, and nowhere else
     cores: float = _AT(shares, *given)
     return cores
 

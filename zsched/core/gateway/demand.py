@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from zsched.core.gateway.company import is_full
 from zsched.core.gateway.job_need import JobNeed, other_s, told_job
-from zsched.core.gateway.shortfall import SHORT_RATIO, is_short, shows_lack
+from zsched.core.gateway.shortfall import SHORT_RATIO, is_full, is_short, shows_lack
 from zsched.core.values.fleet import Demand, TaskSpec
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import MAX_CPU_CORES, Jobs, Profile, Renewal, WorkerLoad, WorkerState

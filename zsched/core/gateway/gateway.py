@@ -110,9 +110,6 @@ class Gateway:
             for one in (self.fresh(name, now) for name in candidates if name != owner):
                 if one is not None:
                     self.shares.look_elsewhere(task, one, now)
-        for name in self.shares.left_by(task, owner):
-            left = self.fresh(name, now)
-            has_share |= left is not None and self.shares.look_back(task, left, now)
         has_need = self.demands.learn(task, profile, now, fastest)
         self.version += has_need or has_share
 

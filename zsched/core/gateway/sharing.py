@@ -3,10 +3,8 @@
 Knows: run queues, what a task got beside how many others. Does not know: how a need is learnt, which node is better.
 
 A fair scheduler (CFS, EEVDF) gives the same to every thread that wants to run. Groups with weights of their own
-(services, sessions) share differently, and nobody can see that from outside. So a share is believed until the task has
-been there. From then on the ratio of what it got to its fair share counts for that machine, and how many of its threads
-wanted to run there: on a quick machine fewer do. Otherwise two machines that both promise more than they give would
-pass the task back and forth for ever.
+(services, sessions) share differently, and nobody can see that from outside: so a share is believed until the task has
+been there and lacked CPU. From then on the part of it that it got counts on that machine.
 """
 
 from __future__ import annotations
@@ -14,15 +12,10 @@ from __future__ import annotations
 from collections.abc import Container
 from typing import Final, Self
 
-from zsched.core.gateway.company import STARVED_CPU_RATIO, is_full, others_cores
-from zsched.core.gateway.job_need import CALM_WAIT_RATIO
-from zsched.core.gateway.shortfall import is_short
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile, WorkerLoad, WorkerState
 from zsched.core.values.struct import Struct, replace
 
-ENDED_S: Final = 60.0
-"""Others that do not fill a machine any more for this time have ended."""
 COUNTED_S: Final = 8.0
 """The threads that came with a task are counted for so long; later ones are others'."""
 LEFT_S: Final = 4.0
@@ -41,20 +34,6 @@ def fair_share(capacity: float, threads: float, others: float) -> float:
     1.5
     """
     return min(capacity * threads / max(threads + others, capacity), capacity)
-
-
-class _Got(Struct, frozen=True):
-    """What a task got on a machine where it lacked CPU; the newest figures."""
-
-    threads: float
-    """Of the task, that wanted to run there."""
-    kept: float
-    """The part of their fair share that it got, at most 1."""
-    machine_cores: float
-    is_crowded: bool = False
-    """Others alone were seen to fill the machine since the task has left."""
-    calm_at: float | None = None
-    """Since when they do not any more; ``None``: they do, or never did."""
 
 
 class _Unmeasured(Struct, frozen=True):
@@ -84,13 +63,14 @@ class Shares:
     def __init__(self) -> None:
         self._threads: dict[TaskId, float] = {}
         """How many of a task's threads wanted to run where it lacked CPU last."""
+        self._kept: dict[tuple[TaskId, NodeId], float] = {}
+        """The part of their fair share that they got last on a machine where a task lacked CPU, at most 1."""
         self._without: dict[tuple[TaskId, NodeId], float] = {}
         """Threads that run or wait on machines where a task is not that nobody measures."""
         self._unmeasured: dict[tuple[TaskId, NodeId], _Unmeasured] = {}
-        self._got: dict[tuple[TaskId, NodeId], _Got] = {}
 
     def learn(self, task: TaskId, profile: Profile, now: float) -> bool:
-        """Note how many threads of the task want to run on its owner, and what they get; whether that has changed.
+        """Note how many threads of the task want to run on its owner; whether that has changed.
 
         A worker that starts does other work, by other threads: that tells nothing of the task.
         """
@@ -98,15 +78,14 @@ class Shares:
         has_changed = self._look_unmeasured(key, profile, now)
         if load is None or load.state is not WorkerState.READY or profile.runnable is None:
             return has_changed
-        if load.cpu_cores is None or not (_is_hungry(load) or _is_held_up(profile, load)):
+        if load.cpu_cores is None or load.wanted_cores is None:
             return has_changed
-        threads = max(threads_of(load) if load.wanted_cores is None else load.wanted_cores, 1.0)
+        threads = max(load.wanted_cores, 1.0)
         own = threads if load.runnable is None else threads_of(load)
-        others = max(profile.runnable - own, 0.0)
-        kept = min(load.cpu_cores / fair_share(profile.cpu_cores, threads, others), 1.0)
-        before, got = self._got.get(key), _Got(threads, kept, profile.cpu_cores)
-        self._threads[task], self._got[key] = threads, got
-        return before != got
+        fair = fair_share(profile.cpu_cores, threads, max(profile.runnable - own, 0.0))
+        before, found = (self._threads.get(task), self._kept.get(key)), (threads, min(load.cpu_cores / fair, 1.0))
+        self._threads[task], self._kept[key] = found
+        return has_changed or before != found
 
     def _look_unmeasured(self, key: tuple[TaskId, NodeId], profile: Profile, now: float) -> bool:
         """Note how many threads came with a worker that nobody measures; whether that has changed."""
@@ -145,39 +124,18 @@ class Shares:
             others = min(others, known.others)  # it has just come: who else wants to run is not seen yet
         return own, others
 
-    def left_by(self, task: TaskId, owner: NodeId) -> tuple[NodeId, ...]:
-        """The nodes on which the task was short, but for its ``owner``."""
-        return tuple(node for name, node in self._got if name == task and node != owner)
-
-    def look_back(self, task: TaskId, profile: Profile, now: float) -> bool:
-        """Forget what the task got beside others that filled the machine, when they have ended: the next share anew.
-
-        A machine that only the task fills is not judged: nobody sees from outside whether it would keep its promise.
-        """
-        key = (task, profile.node)
-        got, others = self._got.get(key), others_cores(task, profile)
-        if got is None or others is None:
-            return False
-        is_crowded = others >= STARVED_CPU_RATIO * profile.cpu_cores
-        calm_at = None if is_crowded or not got.is_crowded else now if got.calm_at is None else got.calm_at
-        if calm_at is not None and now - calm_at > ENDED_S:
-            del self._got[key]
-            return True
-        self._got[key] = replace(got, is_crowded=is_crowded or got.is_crowded, calm_at=calm_at)
-        return False
-
     def keep(self, nodes: Container[NodeId]) -> None:
         """Know nothing of other nodes: one of the same name that comes later is another one."""
         self._without = {key: seen for key, seen in self._without.items() if key[1] in nodes}
         self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[1] in nodes}
-        self._got = {key: got for key, got in self._got.items() if key[1] in nodes}
+        self._kept = {key: one for key, one in self._kept.items() if key[1] in nodes}
 
     def forget(self, task: TaskId) -> None:
         """Know nothing of a task that is no more."""
         self._threads.pop(task, None)
         self._without = {key: seen for key, seen in self._without.items() if key[0] != task}
         self._unmeasured = {key: seen for key, seen in self._unmeasured.items() if key[0] != task}
-        self._got = {key: got for key, got in self._got.items() if key[0] != task}
+        self._kept = {key: one for key, one in self._kept.items() if key[0] != task}
 
     def at(self, task: TaskId, profile: Profile, need_cores: float, coming_cores: float = 0.0) -> float:
         """Cores that the task would get on the node of ``profile`` if it were full; 0 where threads are not counted.
@@ -194,23 +152,8 @@ class Shares:
         load = profile.worker(task)
         own = 0.0 if load is None else threads_of(load)
         others = max(profile.runnable - own + coming_cores, 0.0)
-        got = self._got.get((task, profile.node))
-        if got is None or got.machine_cores != cores:
-            return fair_share(cores, self._threads.get(task) or max(need_cores, 1.0), others)
-        return got.kept * fair_share(cores, got.threads, others)
-
-
-def _is_hungry(load: WorkerLoad) -> bool:
-    """Whether some of its threads always want to run."""
-    return load.wanted_cores is not None
-
-
-def _is_held_up(profile: Profile, load: WorkerLoad) -> bool:
-    """Whether it leaves jobs undone for waits for a CPU, though none of its threads always wants to run."""
-    jobs = load.jobs
-    if jobs is None or jobs.wait_s is None or not is_full(profile):
-        return False
-    return is_short(load) and jobs.wait_s > CALM_WAIT_RATIO * jobs.time_s
+        fair = fair_share(cores, self._threads.get(task) or max(need_cores, 1.0), others)
+        return fair * self._kept.get((task, profile.node), 1.0)
 
 
 def threads_of(load: WorkerLoad) -> float:

@@ -1,4 +1,4 @@
-"""GATEWAY: whether a worker visibly lacks CPU.
+"""GATEWAY: whether a machine is full, and whether a worker visibly lacks CPU.
 
 Knows: threads that always want to run, jobs left undone. Does not know: how needs and shares are learnt.
 """
@@ -7,10 +7,17 @@ from __future__ import annotations
 
 from typing import Final
 
-from zsched.core.values.profile import WorkerLoad
+from zsched.core.values.profile import Profile, WorkerLoad
 
+STARVED_CPU_RATIO: Final = 0.9
+"""On a busier owner a task may get less than it wants: its use is only a lower bound of its need."""
 SHORT_RATIO: Final = 0.9
 """A worker that gets a smaller part of what it wants lacks something."""
+
+
+def is_full(profile: Profile) -> bool:
+    """Whether so little CPU is free that a task's use tells no more what it needs."""
+    return profile.cpu_used_cores is not None and profile.cpu_used_cores / profile.cpu_cores >= STARVED_CPU_RATIO
 
 
 def _is_hungry(load: WorkerLoad) -> bool:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from zsched.core.gateway.company import is_full
 from zsched.core.gateway.demand import Amount, Need
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.sharing import fair_share
-from zsched.core.gateway.shortfall import is_short
+from zsched.core.gateway.shortfall import is_full, is_short
 from zsched.core.scheduler.utility import predicted_use
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, TaskId

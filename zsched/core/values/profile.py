@@ -268,11 +268,6 @@ class Profile(Struct, frozen=True, kw_only=True):
         load = self.worker(task)
         return load is not None and load.trouble is Trouble.RESTS
 
-    def cores_of(self, task: TaskId) -> float:
-        """Cores that ``task``'s worker uses on this node; 0 without a worker or a measurement."""
-        load = self.worker(task)
-        return 0.0 if load is None else load.cpu_cores or 0.0
-
 
 # Goes with the next release: a daemon of the one before tells a worker's trouble by the first words of its reason.
 _OLD_WORDS = {"was ready until ": Trouble.LOST, "restarting": Trouble.AGAIN, "it rests, for it": Trouble.RESTS}

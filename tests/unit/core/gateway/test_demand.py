@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
-from zsched.core.gateway.company import STARVED_CPU_RATIO
 from zsched.core.gateway.demand import HOLDS_ALL_S, UNSURE, Amount, Demands, Need
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.job_need import crowd
+from zsched.core.gateway.shortfall import STARVED_CPU_RATIO
 from zsched.core.values.fleet import Demand
 from zsched.core.values.in_force import InForce
 from zsched.core.values.profile import Jobs, Profile, Renewal, WorkerLoad, WorkerState

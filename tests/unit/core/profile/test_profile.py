@@ -254,7 +254,6 @@ def test_a_worker_that_was_never_measured_has_no_figure() -> None:
 
     profile = taken(profiler, 0.2)
     assert profile.worker("merge") == load(None, None)
-    assert profile.cores_of("merge") == 0.0
 
 
 def test_states_come_from_the_node_not_from_the_sample() -> None:
@@ -267,7 +266,6 @@ def test_states_come_from_the_node_not_from_the_sample() -> None:
         ("merge", WorkerState.FAILED),
     ]
     assert profile.worker("merge") == load(0.5, 100.0, WorkerState.FAILED)
-    assert [profile.cores_of(task) for task in ("merge", "alpha", "other")] == [0.5, 0.0, 0.0]
 
 
 # --- when it is sent -----------------------------------------------------------------------------------------------
