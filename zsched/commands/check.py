@@ -106,8 +106,6 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     terms = (" x " if is_service else " + ").join(f"{name} {share:g}" for name, share in tuning.weights.shares if share)
     yield f"a machine is worth {worth}{in_time} (score: {tuning.score})"
     yield f"{terms} (weights), the robots' {tuning.aggregate} (aggregate)"
-    if is_service and tuning.weights.memory > 0.0:
-        yield f"less where under {100 * spec.memory_floor_ratio:g} % of the memory stay free (memory_floor_ratio)"
     if is_service and tuning.weights.cpu > 0.0 and spec.cpu_floor_ratio > 0.0:
         yield f"less where under {100 * spec.cpu_floor_ratio:g} % of the CPU stay free (cpu_floor_ratio)"
     yield from (f"{more:g} more on {node} (prefer)" for node, more in spec.prefer)

@@ -267,6 +267,7 @@ SCHEDULING: Final = Record(
         "patience": "delete it; or price_s: 0.3, what a move costs in seconds of the task's work",
         "cool_down_s": "delete it; where a move is dear: price_s: 2",
         "max_moves_per_minute": "delete it: it is 6",
+        "memory_floor_ratio": "delete it; what the task needs is kept free: demand: {memory_mb: 2000}",
     },
 )
 

@@ -46,7 +46,6 @@ SWITCHES: Final[Mapping[str, tuple[Switch, ...]]] = {
     "told-lack": ((demand, "_told", _always(None)),),
     "least-need": ((utility, "LEAST_NEED_RATIO", 0.0),),
     "free-room": ((utility, "SPARE", 0.005),),
-    "memory-floor": ((utility, "NEARLY_FULL", 0.0),),
 }
 """{mechanism: what switches it off}."""
 

@@ -454,7 +454,6 @@ def test_epochs_and_revisions_are_counted_from_1_for_people_and_typed_back(daemo
 OWN: Json = {
     **TUNING,
     "price_s": 0.3,
-    "memory_floor_ratio": 0.05,
     "cpu_floor_ratio": 0.0,
     "reach": "majority",
     "nu_dbm": -80.0,
@@ -474,7 +473,7 @@ def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemo
         "reach": "all",
         "nu_dbm": -70.0,
     }
-    assert not {"rho_dbm", "pair", "memory_floor_ratio"} & set(told), "they follow the file"
+    assert not {"rho_dbm", "pair", "cpu_floor_ratio"} & set(told), "they follow the file"
     daemon.status["tasks"][0]["tuning"] = {**OWN, "price_s": 0.5, "reach": "all"}
     assert "price_s=0.5 (file: 0.3)" in run("tune", "echo").stdout
     assert "reach=all (file: majority)" in run("tune", "echo").stdout

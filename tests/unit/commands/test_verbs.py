@@ -95,7 +95,7 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
         ("{score: paper}", ["Eq. 1 and 2"]),
         ("{reach: all, aggregate: median}", ["6 moves", "a robot cannot reach it", "median (aggregate)"]),
         ("{objective: latency, deadline_ms: 80}", ["within 80 ms"]),
-        ("{memory_floor_ratio: 0.2}", ["under 20 %"]),
+        ("{cpu_floor_ratio: 0.2}", ["under 20 %"]),
     ],
 )
 def test_check_says_in_words_when_a_task_moves(tmp_path: Path, scheduling: str, words: list[str]) -> None:

@@ -221,7 +221,7 @@ def test_every_setting_of_a_task_arrives() -> None:
         "[python, -m, zsched.tasks.map_merge], standby: warm}\n",
         """\
     scheduling:
-      {bonus: 0.2, aggregate: median, reach: all, memory_floor_ratio: 0.1,
+      {bonus: 0.2, aggregate: median, reach: all,
        price_s: 0.7, memory_s: 60}
     link: {nu_dbm: -75, rho_dbm: -45, pair: weaker}
     on_isolation: local
@@ -241,7 +241,7 @@ def test_every_setting_of_a_task_arrives() -> None:
     ).replace("class: latest}]", "class: reliable, depth: 99, handover: all}]")
     task = fleet_of(text).task("map_merge")
     assert (task.tuning.bonus, task.price_s, task.memory_s) == (0.2, 0.7, 60)
-    assert (task.tuning.aggregate, task.reach, task.memory_floor_ratio) == (Aggregate.MEDIAN, Reach.ALL, 0.1)
+    assert (task.tuning.aggregate, task.reach) == (Aggregate.MEDIAN, Reach.ALL)
     assert task.limits.pair is PairReading.WEAKER
     assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
@@ -639,6 +639,7 @@ def test_one_fault_is_reported_once_at_its_place(old: str, new: str, said: str |
     [
         ("price_s: 0.4", "price_s: 0.4, patience: 0.4", "patience", "price_s: 0.3"),
         ("price_s: 0.4", "price_s: 0.4, cool_down_s: 2", "cool_down_s", "price_s: 2"),
+        ("price_s: 0.4", "price_s: 0.4, memory_floor_ratio: 0.1", "memory_floor_ratio", "demand: {memory_mb"),
         ("price_s: 0.4", "price_s: 0.4, max_moves_per_minute: 9", "max_moves_per_minute", "it is 6"),
         ("    outputs:", "    link: {foresee_s: 3}\n    outputs:", "foresee_s", "delete it"),
     ],

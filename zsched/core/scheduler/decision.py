@@ -103,7 +103,6 @@ def rules_of(spec: TaskSpec) -> Rules:
     return Rules(
         candidates=spec.candidates,
         reach=spec.reach,
-        memory_floor_ratio=spec.memory_floor_ratio,
         max_moves_per_minute=spec.max_moves_per_minute,
         price_s=spec.price_s,
         memory_s=spec.memory_s,
@@ -120,7 +119,6 @@ def spec_of(figures: Figures) -> TaskSpec:
         candidates=rules.candidates,
         tuning=figures.allocation.tuning,
         reach=rules.reach,
-        memory_floor_ratio=rules.memory_floor_ratio,
         max_moves_per_minute=rules.max_moves_per_minute,
         price_s=rules.price_s,
         memory_s=rules.memory_s,

@@ -26,7 +26,6 @@ from zsched.core.scheduler.usage import Bookings, coming_use, own_use, predicted
 from zsched.core.scheduler.utility import (
     Total,
     cpu_utility,
-    memory_service,
     memory_utility,
     on_time,
     service_utility,
@@ -220,7 +219,7 @@ class _View:
             told["memory"] = (
                 memory_utility(has, need, others)
                 if self._is_paper
-                else memory_service(has - use.memory_mb + need, need, has, spec.memory_floor_ratio)
+                else service_utility(has - use.memory_mb + need, need, has)
             )
         return _Terms(told, link is not None and link.at_limit)
 

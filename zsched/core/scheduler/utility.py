@@ -139,11 +139,11 @@ def timely_worth(on_time_ratio: float) -> float:
 
 
 NEARLY_FULL = 0.15
-"""This part of a term goes where nothing is left beside the task: enough to leave for, in some seconds."""
+"""This part of the CPU's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
 
 
 def spare_factor(left: float, capacity: float, floor_ratio: float) -> float:
-    """What of a term counts where a task leaves so much free: less below the floor, down to 1 - `NEARLY_FULL`.
+    """What of the CPU's term counts where a task leaves so much: less below the floor, down to 1 - `NEARLY_FULL`.
 
     Args:
         left: free beside the task; below 0 counts as 0.
@@ -155,23 +155,6 @@ def spare_factor(left: float, capacity: float, floor_ratio: float) -> float:
     """
     floor = floor_ratio * capacity
     return 1.0 - NEARLY_FULL * clamp(1.0 - left / floor) if left < floor and floor > 0.0 else 1.0
-
-
-def memory_service(free: float, demand: float, capacity: float, floor_ratio: float) -> float:
-    """`service_utility` of memory, and up to `NEARLY_FULL` of it less where the task leaves less than the floor free.
-
-    A task that has its memory works as well on a full machine as on an empty one, until the kernel kills somebody.
-
-    Args:
-        free: not in use by others, MiB.
-        demand: of the task, MiB, >= 0.
-        capacity: of the machine, MiB, > 0.
-        floor_ratio: of the machine, in [0, 1).
-
-    >>> round(memory_service(free=400.0, demand=300.0, capacity=4000.0, floor_ratio=0.05), 3)
-    0.908
-    """
-    return service_utility(free, demand, capacity) * spare_factor(free - demand, capacity, floor_ratio)
 
 
 def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:

@@ -20,7 +20,6 @@ class Rules(Struct, frozen=True, kw_only=True):
 
     candidates: tuple[NodeId, ...]
     reach: Reach
-    memory_floor_ratio: float
     max_moves_per_minute: int
     price_s: float = 0.3
     memory_s: float = 1000.0

@@ -217,9 +217,9 @@ class LinkLimits:
     )
 
 
-TASK_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s", "memory_s", "priority")
+TASK_RULES = ("reach", "cpu_floor_ratio", "price_s", "memory_s", "priority")
 """Keys of `scheduling` that are fields of `TaskSpec`, under the same name."""
-TUNED_RULES = ("reach", "memory_floor_ratio", "cpu_floor_ratio", "price_s")
+TUNED_RULES = ("reach", "cpu_floor_ratio", "price_s")
 TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair")
 """Settings of a task's file that a `Tuning` may set anew: fields of `TaskSpec` and of `LinkLimits`."""
 
@@ -237,14 +237,10 @@ class TaskSpec:
     gauge_limits: Readings = ()
     """Sorted; how far a candidate's gauges may go (`zsched.core.values.gauges`)."""
     reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate, of the robots that answer.")
-    memory_floor_ratio: float = key(
-        0.05,
-        "Where the task leaves less memory free, memory counts up to 15 % less; not with `score: paper`.",
-        Range(0, MAX_FLOOR),
-    )
     cpu_floor_ratio: float = key(
         0.0,
-        "The same of CPU: room for programs that are no tasks, such as a robot's SLAM.",
+        "Where the task leaves less CPU free, it counts up to 15 % less: room for programs that are no tasks, such as "
+        "a robot's SLAM.",
         Range(0, MAX_FLOOR),
     )
     price_s: float = key(

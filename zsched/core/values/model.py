@@ -179,7 +179,6 @@ class Tuning(Struct, frozen=True, kw_only=True):
     `Objective.SERVICE`. `ScoreForm.PAPER` knows no deadlines."""
     price_s: float | None = None
     """From here on ``None``: as the fleet file says, also when the file changes."""
-    memory_floor_ratio: float | None = None
     reach: Reach | None = None
     nu_dbm: float | None = None
     rho_dbm: float | None = None
@@ -195,7 +194,6 @@ class Tuning(Struct, frozen=True, kw_only=True):
         check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
         check_range("price_s", self.price_s, 0.0, MAX_PRICE_S)
-        check_range("memory_floor_ratio", self.memory_floor_ratio, 0.0, MAX_FLOOR)
         check_range("cpu_floor_ratio", self.cpu_floor_ratio, 0.0, MAX_FLOOR)
         check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)

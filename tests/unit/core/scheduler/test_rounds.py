@@ -597,7 +597,7 @@ class RobotOfOrphans(RobotOfTwo):
         super().__init__(me)
         (merge, _) = self.rounds.tasks.values()
         candidates, demand = ("edge1", "edge2", "robot3"), Demand(memory_mb=1400.0)
-        need = replace(merge.file, candidates=candidates, demand=demand, memory_floor_ratio=0.0)
+        need = replace(merge.file, candidates=candidates, demand=demand)
         fleet = replace(FLEET, tasks=(need, replace(need, name="plan", candidates=plan_on)))
         self.gateway = Gateway(InForce(fleet))
         self.decider = Decider(fleet, me, self.gateway, now=self.now)

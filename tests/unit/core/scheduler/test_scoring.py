@@ -125,24 +125,6 @@ def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_an_owner_that_l
     assert short["edge1"] == untold["edge1"] == pytest.approx(service_utility(0.2, 2.0, 4.0))
 
 
-def test_a_task_that_has_its_memory_counts_a_full_machine_less_and_not_for_nothing() -> None:
-    half = Weights(cpu=0.5, memory=0.5, network=0.0)
-    spec = replace(SPEC, demand=Demand(cpu_cores=0.4, memory_mb=400.0), memory_floor_ratio=0.05)
-
-    def term(used_mb: float, form: ScoreForm = ScoreForm.SERVICE) -> float:
-        agreed = replace(allocation(half, owner=None), tuning=Tuning(weights=half, score=form))
-        found = scored(ROBOT, profile("edge1", memory=used_mb), spec=spec, agreed=agreed).utilities[0].memory
-        assert found is not None
-        return found
-
-    enough, half_way, nothing = term(3400.0), term(3500.0), term(3600.0)
-    assert term(3600.0, ScoreForm.PAPER) == 0.0
-    assert enough - DEFAULT_BONUS > half_way - DEFAULT_BONUS > nothing, (
-        "a full one is worth a move, a half full one late"
-    )
-    assert nothing == pytest.approx(enough * (1.0 - NEARLY_FULL), abs=0.01)
-
-
 def test_a_machine_that_a_task_fills_counts_less_where_others_are_to_have_their_cpu() -> None:
     """It gets all that it needs on both; on the second one programs that are no tasks would have nothing left."""
     agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
@@ -169,7 +151,7 @@ def test_an_owner_has_the_memory_that_it_holds_though_not_all_of_it_shows_as_its
     """2000 of 4000 MiB are the task's, of which its processes show 100; the others have 800."""
     half = Weights(cpu=0.5, memory=0.5, network=0.0)
     demand = Demand(cpu_cores=0.4, memory_mb=2000.0)
-    spec = replace(SPEC, candidates=("edge1", "edge2"), demand=demand, memory_floor_ratio=0.05)
+    spec = replace(SPEC, candidates=("edge1", "edge2"), demand=demand)
     agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=half, score=ScoreForm.SERVICE))
     owner = profile("edge1", memory=2800.0, own=(0.0, 100.0))
     vector = scored(owner, profile("edge2", memory=800.0), spec=spec, agreed=agreed)

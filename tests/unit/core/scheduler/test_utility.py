@@ -14,7 +14,6 @@ from zsched.core.scheduler.utility import (
     LEAST_NEED_RATIO,
     clamp,
     cpu_utility,
-    memory_service,
     memory_utility,
     network_utility,
     predicted_use,
@@ -177,7 +176,7 @@ def test_a_task_that_lacks_nothing_is_not_moved_for_more_room(cores: float, memo
 
     def worth(free_cores: float, free_mb: float) -> float:
         cpu = service_utility(free_cores, need_cores, cores)
-        room = memory_service(free_mb, need_mb, memory, 0.0)
+        room = service_utility(free_mb, need_mb, memory)
         shares = Weights(cpu=0.5, memory=0.5, network=0.0)
         return total_utility(shares, cpu=cpu, memory=room, network=None, measured=ALL, form=SERVICE) or 0.0
 

@@ -133,7 +133,6 @@ def test_electorate_hash_depends_on_fleet_and_electors_only() -> None:
 
 OWN: dict[str, Any] = {
     "price_s": 0.7,
-    "memory_floor_ratio": 0.3,
     "cpu_floor_ratio": 0.2,
     "reach": Reach.ALL,
     "nu_dbm": -70.0,
@@ -156,7 +155,7 @@ def test_a_tuning_sets_what_it_names_and_leaves_the_rest_to_the_file() -> None:
 
 
 def test_ranges_are_those_of_the_file_and_a_signal_that_does_not_fit_the_file_is_left_out() -> None:
-    wrong: dict[str, Any] = {"price_s": -1.0, "memory_floor_ratio": 0.95, "nu_dbm": 1.0}
+    wrong: dict[str, Any] = {"price_s": -1.0, "cpu_floor_ratio": 0.95, "nu_dbm": 1.0}
     for key, value in wrong.items():
         with pytest.raises(ValueError, match=key):
             replace(TUNING, **{key: value})

@@ -48,7 +48,6 @@ def test_a_changed_setting_is_wanted_and_the_others_stay_as_they_were_tuned() ->
     [
         ({"price_s": 0.7}, {"price_s": 0.3}, {"price_s": 0.4}),
         ({"cpu_floor_ratio": 0.2}, {}, {"cpu_floor_ratio": 0.1}),
-        ({"memory_floor_ratio": 0.3}, {}, {"memory_floor_ratio": 0.2}),
         ({"reach": Reach.MAJORITY}, {}, {"reach": Reach.ALL}),
         ({"nu_dbm": -70.0}, {}, {"limits": LinkLimits(nu_dbm=-75.0)}),
         ({"rho_dbm": -30.0}, {}, {"limits": LinkLimits(rho_dbm=-45.0)}),

@@ -71,7 +71,6 @@ _DECISION = decision.Decision(
         rules=decision.Rules(
             candidates=("edge1", "edge2"),
             reach=model.Reach.MAJORITY,
-            memory_floor_ratio=0.05,
             max_moves_per_minute=6,
             price_s=0.3,
             memory_s=1000.0,
