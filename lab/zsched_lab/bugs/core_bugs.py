@@ -1153,8 +1153,8 @@ VOTE_BUGS = (
     _bug(
         "what comes is taken off the share of an owner that is short",
         SCORING,
-        "least=min(fair, own), most",
-        "least=0.0, most",
+        "least=min(fair, own), share",
+        "least=0.0, share",
         ("tests/unit/core/scheduler/test_bookings.py", "tests/unit/core/test_closed_loop_tasks.py"),
     ),
     _bug(
@@ -1174,8 +1174,8 @@ VOTE_BUGS = (
     _bug(
         "a need is kept for as long as the machine is full",
         "zsched.core.gateway.demand",
-        "is_full(profile) and not _gets_all(load, load.cpu_cores)",
-        "is_full(profile)",
+        "not is_calm and not _gets_all(load, load.cpu_cores)",
+        "not is_calm",
         ("tests/unit/core/gateway/test_demand.py",),
     ),
     _bug(
