@@ -14,7 +14,7 @@ from zsched.core.executor.rollouts import waiting
 from zsched.core.gateway.shortfall import is_full, is_short
 from zsched.core.route.rates import STALE_S
 from zsched.core.scheduler.eligibility import OF_MACHINE, may_get
-from zsched.core.scheduler.judge import by, preferred
+from zsched.core.scheduler.judge import by
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.scheduler.scoring import score
 from zsched.core.stages import UNREADY_SHOWN_S, Stages, Unready
@@ -707,10 +707,9 @@ def _move_gap(node: Stages, executor: Executor) -> float | None:
 
 
 def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
-    judgement, joint, figures = standing.judgement, standing.standing, standing.figures
-    if judgement is None or joint is None or figures is None:
+    judgement, joint = standing.judgement, standing.standing
+    if judgement is None or joint is None:
         return None
-    promised = preferred(joint.aggregates, dict(figures.head_starts))
     return DecisionStatus(
         outcome=judgement.outcome.value,
         winner=judgement.candidate,
@@ -719,7 +718,7 @@ def _decision(standing: TaskRound, now: float) -> DecisionStatus | None:
         aggregates=tuple(sorted(judgement.aggregates.items())),
         utilities=tuple((vector.voter, vector.utilities) for vector in joint.vectors),
         vetoed=tuple((name, veto.why) for name, veto in sorted(joint.vetoed.items())),
-        unkept=tuple(sorted(standing.judge.kept.unkept(promised, standing.judge.spec.memory_s, now).items())),
+        unkept=tuple(sorted(judgement.unkept.items())),
         owed=tuple(sorted(judgement.owed.items())),
         silent=standing.silent,
     )

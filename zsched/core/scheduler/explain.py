@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from zsched.core.scheduler.decision import Decided, decide_again, verdict_of
 from zsched.core.scheduler.eligibility import FOR_COMERS
 from zsched.core.scheduler.fuse import WINDOW_S, Fuse
-from zsched.core.scheduler.judge import Outcome, preferred
-from zsched.core.scheduler.kept import Kept
+from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.standing import Standing, pick, rounded
 from zsched.core.values.decision import Decision, Figures, Verdict
 from zsched.core.values.model import NodeId, PeerState, Tuning, Utility, UtilityVector
@@ -203,9 +202,7 @@ def _sums(decision: Decision, again: Decided) -> tuple[CandidateSum, ...]:
     figures, standing = decision.figures, again.standing
     owner, tuning, head_starts = figures.allocation.owner, figures.allocation.tuning, dict(figures.head_starts)
     needs = {need.candidate: need for need in decision.needs}
-    kept = Kept.of(replace(figures.judge.kept, owner=owner))
-    promised = preferred(standing.aggregates, head_starts)
-    unkept = kept.unkept(promised, figures.rules.memory_s, figures.now)
+    unkept = again.judgement.unkept
     found = []
     for name in figures.rules.candidates:
         is_left = name == owner and again.leaving is not None

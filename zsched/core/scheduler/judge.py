@@ -60,6 +60,8 @@ class Judgement(Struct, frozen=True, kw_only=True):
     is_escape: bool = False
     aggregates: Mapping[NodeId, float] = field(default_factory=dict)
     """With the owner's bonus."""
+    unkept: Mapping[NodeId, float] = field(default_factory=dict)
+    """{machine: what is taken off its worth, for what it did not keep}, of those from which something is."""
     owed: Mapping[NodeId, float] = field(default_factory=dict)
     """{who can have the task: seconds of work that it owes, with what it will lose}."""
 
@@ -181,9 +183,10 @@ class Judge:
         owner = allocation.owner
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
-        told = preferred(standing.aggregates, head_starts)
+        told = {name: value + head_starts.get(name, 0.0) for name, value in standing.aggregates.items()}
         self.kept.look(told, owner, now)
         worth = self.kept.corrected(told, owner, self.spec.memory_s, now)
+        unkept = {name: told[name] - value for name, value in worth.items() if value < told[name]}
         if owner in worth:
             worth[owner] += allocation.tuning.bonus
         home = allocation.home
@@ -200,7 +203,7 @@ class Judge:
         )
         if winner is None:
             reason = _nobody(allocation, f"{leaving}; it keeps the task, for " if is_drain else "")
-            return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason)
+            return Judgement(outcome=Outcome.NONE, candidate=owner, aggregate=0.0, reason=reason, unkept=unkept)
         rests = standing.kept_out_by(owner) is Filter.RESTS
         is_kept = home is not None and not rests and not (is_unheard and winner != home)
         outcome, reason = self._outcome(winner, expected, allocation, leaving, is_called, now, is_kept)
@@ -215,6 +218,7 @@ class Judge:
             reason=reason,
             is_escape=escape is not None and outcome is Outcome.PROPOSE,
             aggregates=scored,
+            unkept=unkept,
             owed=expected,
         )
 
@@ -301,11 +305,6 @@ class Judge:
         if missing and waited < INITIAL_SETTLE_S and not is_called:  # who calls has waited for all of us
             return Outcome.WAIT, f"first placement waits for {', '.join(missing)}"
         return Outcome.PROPOSE, f"first placement: {winner} is worth most"
-
-
-def preferred(aggregates: Mapping[NodeId, float], head_starts: Mapping[NodeId, float]) -> dict[NodeId, float]:
-    """What machines are worth with what the file says of them: this is what they promise."""
-    return {name: value + head_starts.get(name, 0.0) for name, value in aggregates.items()}
 
 
 def _nobody(allocation: Allocation, why: str) -> str:

@@ -93,11 +93,6 @@ class Kept(Struct):
         """Whether that is so still."""
         return node in self.seen and self.seen[node][2] > now
 
-    def unkept(self, worth: Mapping[NodeId, float], memory_s: float, now: float) -> dict[NodeId, float]:
-        """{machine: what is taken off its worth}, of those from which something is."""
-        found = self.corrected(worth, self.owner, memory_s, now)
-        return {name: worth[name] - found[name] for name in worth if found[name] < worth[name]}
-
     def corrected(
         self, worth: Mapping[NodeId, float], owner: NodeId | None, memory_s: float, now: float
     ) -> dict[NodeId, float]:
