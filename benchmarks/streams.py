@@ -41,7 +41,7 @@ from zsched.core.values.plan import (
 )
 from zsched.sessions.config import data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoint
-from zsched_lab.fleet.relays import FLEET
+from zsched_lab.fleet.relays import FLEET, hello_of
 from zsched_lab.fleet.waiting import until
 
 HOPS = ("direct", "router", "naive", "best_effort", "reliable")
@@ -168,7 +168,12 @@ class Bench:
             process = self._start(NAIVE if self._hop == "naive" else ROUTER, "hop", IN, OUT, is_hub=True)
             return process.pid
         text = data_config(listen=(self._endpoint,), connect=(), shared_memory=self._shared)
-        self._relay = RelayHandle(fleet=FLEET, node="robot1", zenoh_config=text, on_report=self._heard.append)
+        self._relay = RelayHandle(
+            hello=hello_of(FLEET, "robot1"),
+            path=self._folder / "robot1.relay",
+            zenoh_config=text,
+            on_report=self._heard.append,
+        )
         self._relay.start()
         until(lambda: any(isinstance(r, RelayChanged) and r.is_running for r in self._heard), "the relay runs")
         return self._relay.pid

@@ -32,7 +32,7 @@ from zsched.adapters.host.state_file import StateFile
 from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
 from zsched.adapters.network.control_bus import ControlBus
 from zsched.adapters.network.limits import in_turn_hz, limit_for
-from zsched.adapters.relay.streams import SILENCE_S, Bequest, RelayHandle
+from zsched.adapters.relay.streams import SILENCE_S, RelayHandle
 from zsched.adapters.workers.hired import FOLDER, relay_socket
 from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.clock import SleepWatch, monotonic_s
@@ -51,7 +51,8 @@ from zsched.errors import AdapterError, ConfigError, NameTakenError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.guard import calmed, end_with, on_failure
 from zsched.heap import Leftovers, give_back, share_heaps
-from zsched.ipc.takeover import Door
+from zsched.ipc.protocol import RelayHello
+from zsched.ipc.relay_socket import PROTOCOL, ask_relay
 from zsched.log_limit import log_to_stderr
 from zsched.runtime import tls as daemon_tls
 from zsched.runtime.access import StreamAccess, joins_at
@@ -128,7 +129,7 @@ class Daemon:
         self._sleeps = SleepWatch()
         self._certificate = ""
         """Digest of the certificate that open sessions listen with."""
-        self._door = Door(options.runtime_dir, options.node)
+        self._relay_path = places.relay_path(options.runtime_dir, options.node)
         self._is_ready = False
         self._library = Library(
             fleet=self._fleet.name,
@@ -251,9 +252,9 @@ class Daemon:
         self._memory_objection = shared_memory_objection(self._fleet, self._spec)
 
     def _data_port(self, stack: contextlib.ExitStack) -> int:
-        """A port for the data session: that of the relay that may be taken over, else the default, else a free one."""
-        note = self._door.note()
-        if note is not None and (port := Endpoint.of(note.listen).port):
+        """A port for the data session: that of the relay that runs, else the default, else a free one."""
+        here = ask_relay(self._relay_path)
+        if here is not None and here.listen and (port := Endpoint.of(here.listen).port):
             return port
         claim = claim_port(DATA_PORT)
         if claim is None:
@@ -313,7 +314,7 @@ class Daemon:
         stack.callback(self._library.close)
         decisions.start()
         stack.callback(decisions.close)
-        shell.relay = relay = self._relay(shell, incarnation, points)
+        shell.relay = relay = self._relay(shell, points)
         shell.crew.supervisor = supervisor = self._supervisor(stack, shell, incarnation, points)
         shell.crew.begin()
         sampler = Sampler(
@@ -349,23 +350,24 @@ class Daemon:
         stack.callback(sampler.stop)
         return shell
 
-    def _relay(self, shell: Shell, incarnation: int, points: Endpoints) -> RelayHandle:
+    def _relay(self, shell: Shell, points: Endpoints) -> RelayHandle:
         fleet = self._fleet
         size, tasks = len(fleet.nodes), tuple(task.name for task in fleet.tasks)
         threads = zenoh_config.pool_threads(size, len(tasks))
-        bequest = Bequest(
-            door=self._door,
-            orphan_s=fleet.relay_orphan_s,
-            incarnation=incarnation,
-            digest=" ".join(() if self._spec.local else self._watch.gossiped),
-            listen=points.data_listen[0],
-            certificate="" if fleet.security is None else digest_of(fleet.security),
-            tasks=tasks,
-            spare_threads=zenoh_config.pool_threads(size + SPARE_NODES, len(tasks)) - threads,
-        )
-        return RelayHandle(
+        hello = RelayHello(
+            protocol=PROTOCOL,
             fleet=fleet.name,
             node=self._spec.name,
+            threads=threads,
+            spare_threads=zenoh_config.pool_threads(size + SPARE_NODES, len(tasks)) - threads,
+            certificate="" if fleet.security is None else digest_of(fleet.security),
+            addresses=() if self._spec.local else self._watch.gossiped,
+            listen=points.data_listen[0],
+            tasks=tasks,
+        )
+        return RelayHandle(
+            hello=hello,
+            path=self._relay_path,
             zenoh_config=zenoh_config.data_config(
                 listen=self._data_listen(points),
                 connect=points.data_connect,
@@ -375,10 +377,8 @@ class Daemon:
                 dials_by_gossip=points.data_by_gossip,
             ),
             on_report=shell.on_report,
-            threads=threads,
             local_config=zenoh_config.local_config(side, timing=fleet.timing) if (side := self._spec.local) else "",
             silence_s=max(SILENCE_S, fleet.timing.zenoh_lease_s + 0.5),
-            bequest=bequest if fleet.relay_orphan_s > 0 else None,
         )
 
     def _data_listen(self, points: Endpoints) -> tuple[str, ...]:

@@ -132,6 +132,11 @@ def socket_path(runtime: Path, node: NodeId) -> Path:
     return runtime / f"{node}.sock"
 
 
+def relay_path(runtime: Path, node: NodeId) -> Path:
+    """The socket at which one node's relay waits for its daemon."""
+    return runtime / f"{node}.relay"
+
+
 def again_path(runtime: Path, node: NodeId) -> Path:
     """The mark of a daemon on this machine that begins again in its process, until its operator socket is there."""
     return runtime / f"{node}.again"

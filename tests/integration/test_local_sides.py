@@ -9,6 +9,7 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,6 +33,7 @@ from zsched.core.values.plan import (
     StreamSettings,
 )
 from zsched.sessions.config import client_config, data_config, local_config, worker_config
+from zsched_lab.fleet.relays import hello_of
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TASK = "merge"
@@ -49,6 +51,7 @@ def router(endpoint: str) -> zenoh.Session:
 class Robot:
     """One host: its router, its application and its relay."""
 
+    folder: Path
     name: str
     seed: str
     mode: LocalMode = LocalMode.CLIENT
@@ -61,8 +64,8 @@ class Robot:
     def start_relay(self) -> None:
         side = LocalSide(mode=self.mode, connect=(self.endpoint,))
         self.relay = RelayHandle(
-            fleet="test",
-            node=self.name,
+            hello=hello_of("test", self.name),
+            path=self.folder / f"{self.name}.relay",
             zenoh_config=data_config(listen=("tcp/127.0.0.1:0",), connect=(self.seed,), shared_memory=False),
             on_report=self.reports.append,
             local_config=local_config(side),
@@ -136,12 +139,12 @@ class Edge:
 
 
 @pytest.fixture
-def rig() -> Iterator[tuple[Edge, dict[str, Robot]]]:
+def rig(tmp_path: Path) -> Iterator[tuple[Edge, dict[str, Robot]]]:
     seed = free_endpoint()
     with contextlib.ExitStack() as stack:
         edge = Edge(seed)
         stack.callback(edge.session.close)
-        robots = {name: Robot(name=name, seed=seed) for name in ROBOTS}
+        robots = {name: Robot(folder=tmp_path, name=name, seed=seed) for name in ROBOTS}
         for robot in robots.values():
             stack.callback(robot.stop)
         yield edge, robots

@@ -11,7 +11,7 @@ import zenoh
 
 from support.books import assert_nothing_is_unaccounted
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import Bequest, RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import HandleReport
 from zsched.core.values.plan import (
@@ -24,8 +24,8 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.ipc.takeover import Door
 from zsched.sessions.config import data_config, worker_config
+from zsched_lab.fleet.relays import hello_of
 
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500)
 
@@ -63,13 +63,11 @@ class Node:
 
     def daemon(self) -> RelayHandle:
         self.reports.clear()
-        door = Door(self.folder, "robot1")
         handle = RelayHandle(
-            fleet="test",
-            node="robot1",
+            hello=hello_of("test", "robot1"),
+            path=self.folder / "robot1.relay",
             zenoh_config=data_config(listen=(self.endpoint,), connect=(), shared_memory=False),
             on_report=self.reports.append,
-            bequest=Bequest(door=door, orphan_s=20.0, incarnation=len(self.handles) + 1, digest=""),
         )
         self.handles.append(handle)
         handle.start()
@@ -107,7 +105,7 @@ def node(tmp_path: Path) -> Iterator[Node]:
         assert_nothing_is_unaccounted(lambda: tuple(made.reports))
     finally:
         made.handles[-1].stop(2.0)
-        # its child is reaped, whoever stopped it (a relay leaves its door a moment before it has ended)
+        # its child is reaped, whoever stopped it
         until(lambda: made.handles[0].pid is None, "the end of the first daemon's child")
 
 

@@ -18,7 +18,7 @@ import pytest
 import zsched
 from support.waiting import within
 from zsched.core.values.model import NodeId
-from zsched.ipc.takeover import PROTOCOL
+from zsched.ipc.relay_socket import PROTOCOL
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 
@@ -160,7 +160,7 @@ def end_daemon(bed: Testbed, node: NodeId, how: str) -> None:
 def test_a_robots_streams_run_on_while_its_daemon_restarts(
     fleets: Callable[[str], Testbed], kind: str, how: str
 ) -> None:
-    """Nothing lost, no pause, the same relay; the daemon that follows takes it over and the task stays."""
+    """Nothing lost, no pause, the same relay; the daemon that follows connects to it and the task stays."""
     bed = fleets(kind)
     owner, epoch, relay = bed.wait_settled(), bed.task("robot1")["epoch"], relay_of(bed, "robot1")
     talker = Talker(bed)
@@ -179,7 +179,6 @@ def test_a_robots_streams_run_on_while_its_daemon_restarts(
     within(gap_s, 0.5, "between two answers")
     assert relay_of(bed, "robot1") == relay
     assert bed.task("robot1")["epoch"] == epoch
-    assert "taken over" in bed.log("robot1")
 
 
 def test_an_upgrade_that_replaces_a_robots_relay_loses_no_answer_that_had_come(
@@ -206,7 +205,7 @@ def test_an_upgrade_that_replaces_a_robots_relay_loses_no_answer_that_had_come(
 def with_another_protocol(folder: Path) -> Path:
     """Where a package is whose daemons cannot go on with the relays of this one."""
     shutil.copytree(Path(zsched.__file__).parent, folder / "zsched", ignore=shutil.ignore_patterns("__pycache__"))
-    path = folder / "zsched/ipc/takeover.py"
+    path = folder / "zsched/ipc/relay_socket.py"
     text = path.read_text()
     path.write_text(text.replace(f"PROTOCOL: Final = {PROTOCOL}\n", f"PROTOCOL: Final = {PROTOCOL + 1}\n"))
     assert path.read_text() != text

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +28,13 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.ipc.pipe import REPORTS, read_frame, write_frame
-from zsched.ipc.protocol import RelayPulse
+from zsched.ipc.pipe import REPORTS, read_frame, set_timeout, write_frame
+from zsched.ipc.protocol import RelayHere, RelayPulse
+from zsched.ipc.relay_socket import ask_relay, dial
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
 from zsched.wire.keyspace import Keyspace
+from zsched_lab.fleet.relays import hello_of
 
 ROUTE = Route(
     stream="t/in/0",
@@ -47,32 +48,38 @@ END_S = 5.0
 """A relay ends itself within a second; a busy machine may need longer to let it."""
 
 
-@contextlib.contextmanager
-def relay(*options: str, pass_fds: tuple[int, ...] = ()) -> Iterator[subprocess.Popen[bytes]]:
-    """A relay's process, which has not been told its session yet; at the end it is gone."""
-    command = [sys.executable, "-m", "zsched.relay", "--fleet", "test", "--node", "robot1", *options]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0, pass_fds=pass_fds)
-    try:
-        yield child
-    finally:
-        child.kill()
-        child.wait(60)
-        for pipe in (child.stdin, child.stdout):
-            if pipe is not None:
-                pipe.close()
+@dataclass
+class Relay:
+    """A relay's process, and the link to it once it has been greeted."""
+
+    process: subprocess.Popen[bytes]
+    path: Path
+    link: socket.socket | None = None
+
+    def begin(self, config: str = CONFIG) -> int:
+        """Greet it; the link's descriptor."""
+        link: socket.socket = until(lambda: dial(self.path), "it listens")
+        self.link = link
+        set_timeout(link, 0.0)
+        for frame in (wire.encode(hello_of(FLEET, "robot1")), config.encode()):
+            write_frame(link.fileno(), frame)
+        answer = read_frame(link.fileno())
+        assert answer is not None
+        wire.decode(answer, RelayHere)
+        return link.fileno()
 
 
 @pytest.fixture
-def process() -> Iterator[subprocess.Popen[bytes]]:
-    with relay() as child:
-        yield child
-
-
-def begin(child: subprocess.Popen[bytes], config: str = CONFIG) -> tuple[int, int]:
-    assert child.stdin is not None
-    assert child.stdout is not None
-    write_frame(child.stdin.fileno(), config.encode())
-    return child.stdin.fileno(), child.stdout.fileno()
+def relay(tmp_path: Path) -> Iterator[Relay]:
+    path = tmp_path / "relay"
+    made = Relay(subprocess.Popen([sys.executable, "-m", "zsched.relay", "--socket", str(path)]), path)
+    try:
+        yield made
+    finally:
+        made.process.kill()
+        made.process.wait(60)
+        if made.link is not None:
+            made.link.close()
 
 
 def next_word(descriptor: int) -> Any:
@@ -88,57 +95,49 @@ def next_report(descriptor: int) -> Any:
     return word
 
 
-def test_it_says_that_it_started_and_counts_every_second(process: subprocess.Popen[bytes]) -> None:
-    _, reports = begin(process)
+def test_it_says_that_it_started_and_counts_every_second(relay: Relay) -> None:
+    reports = relay.begin()
     started = next_report(reports)
     assert isinstance(started, RelayStarted)
-    assert started.pid == process.pid
+    assert started.pid == relay.process.pid
     assert isinstance(next_report(reports), StreamsCounted)
 
 
-def test_it_gives_a_sign_of_life_between_its_counts(process: subprocess.Popen[bytes]) -> None:
-    _, reports = begin(process)
+def test_it_gives_a_sign_of_life_between_its_counts(relay: Relay) -> None:
+    reports = relay.begin()
     words = [next_word(reports) for _ in range(5)]
     ages = [word.counted_s for word in words if isinstance(word, RelayPulse)]
     assert ages
     assert all(age < 5.0 for age in ages)
 
 
-def test_it_ends_when_the_pipe_ends(process: subprocess.Popen[bytes]) -> None:
-    _, reports = begin(process)
+def test_it_ends_when_told(relay: Relay) -> None:
+    link = relay.begin()
+    next_report(link)
+    write_frame(link, wire.encode(RelayStop()))
+    assert relay.process.wait(END_S) == 0
+    assert not relay.path.exists()
+
+
+@pytest.mark.parametrize("has_daemon", [False, True])
+def test_a_sigterm_ends_it(relay: Relay, *, has_daemon: bool) -> None:
+    if has_daemon:
+        next_report(relay.begin())
+    else:
+        until(lambda: ask_relay(relay.path), "it answers")
+    relay.process.send_signal(signal.SIGTERM)
+    assert relay.process.wait(END_S) == 0
+    assert not relay.path.exists()
+
+
+def test_ctrl_c_on_the_terminal_is_the_daemons_business(relay: Relay) -> None:
+    reports = relay.begin()
     next_report(reports)
-    assert process.stdin is not None
-    process.stdin.close()
-    assert process.wait(END_S) == 0
-
-
-@pytest.mark.parametrize("is_asked_before", [False, True])
-def test_it_ends_when_told(process: subprocess.Popen[bytes], *, is_asked_before: bool) -> None:
-    commands, reports = begin(process)
-    next_report(reports)
-    if is_asked_before:
-        process.send_signal(signal.SIGTERM)
-    write_frame(commands, wire.encode(RelayStop()))
-    assert process.wait(END_S) == 0
-
-
-def test_a_sigterm_leaves_the_daemon_time_for_its_own_orderly_stop(process: subprocess.Popen[bytes]) -> None:
-    """It reaches the whole process group, and the daemon needs its robot's streams while it hands its tasks over."""
-    _, reports = begin(process)
-    next_report(reports)
-    process.send_signal(signal.SIGTERM)
-    assert isinstance(next_report(reports), StreamsCounted)
-    assert process.wait(END_S + 3) == 0
-
-
-def test_ctrl_c_on_the_terminal_is_the_daemons_business(process: subprocess.Popen[bytes]) -> None:
-    _, reports = begin(process)
-    next_report(reports)
-    process.send_signal(signal.SIGINT)
+    relay.process.send_signal(signal.SIGINT)
     assert isinstance(next_report(reports), StreamsCounted)
 
 
-def test_a_port_that_is_taken_is_a_problem_in_words(process: subprocess.Popen[bytes]) -> None:
+def test_a_port_that_is_taken_is_a_problem_in_words(relay: Relay) -> None:
     import socket
 
     with socket.socket() as taken:
@@ -146,15 +145,15 @@ def test_a_port_that_is_taken_is_a_problem_in_words(process: subprocess.Popen[by
         taken.listen()
         port = taken.getsockname()[1]
         config = data_config(listen=(f"tcp/127.0.0.1:{port}",), connect=())
-        _, reports = begin(process, config)
+        reports = relay.begin(config)
         problem = next_report(reports)
     assert isinstance(problem, ProblemReported)
     assert f"cannot listen on tcp/127.0.0.1:{port}: another program has that port" in str(problem.problem)
-    assert process.wait(60) == 1
+    assert relay.process.wait(60) == 1
 
 
-def test_garbage_and_bad_plans_are_reported_and_survived(process: subprocess.Popen[bytes]) -> None:
-    commands, reports = begin(process)
+def test_garbage_and_bad_plans_are_reported_and_survived(relay: Relay) -> None:
+    commands = reports = relay.begin()
     next_report(reports)
     write_frame(commands, b"garbage")
     bad = Slot(epoch=1, owner="edge1", routes=(replace(ROUTE, to_expr="edge1/*/in"),), ready_when=ReadyWhen.TOKEN)
@@ -166,10 +165,10 @@ def test_garbage_and_bad_plans_are_reported_and_survived(process: subprocess.Pop
 
 
 def test_what_a_plan_could_not_open_is_over_with_the_next_one_that_opens_whole(
-    process: subprocess.Popen[bytes],
+    relay: Relay,
 ) -> None:
     """The operator mends the template: the problem stayed in the status until the daemon began again."""
-    commands, reports = begin(process)
+    commands = reports = relay.begin()
     next_report(reports)
     bad, other = replace(ROUTE, to_expr="edge1/*/in"), replace(ROUTE, to_expr="edge1/*/*/in")
     told: list[str] = []
@@ -211,19 +210,3 @@ def test_a_role_whose_token_goes_is_told_again_by_the_relay(tmp_path: Path) -> N
         until(lambda: told, "the role again")
         assert told == [Role(task=TASK, role=WorkerRole.ACTIVE, epoch=2)]
         watch.undeclare()
-
-
-def test_a_relay_whose_daemon_died_before_it_looked_waits_for_no_successor_in_that_process(tmp_path: Path) -> None:
-    """Who its parent is by then says nothing; it waited a minute for the dead one to become its own successor."""
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    assert dead.wait(30.0) == 0
-    with socket.socket(socket.AF_UNIX) as door:
-        door.bind(str(tmp_path / "door"))
-        door.listen()
-        options = ["--orphan", "0.2", "--door", str(door.fileno()), "--parent", str(dead.pid)]
-        with relay(*options, pass_fds=(door.fileno(),)) as child:
-            _, reports = begin(child)
-            next_report(reports)
-            assert child.stdin is not None
-            child.stdin.close()
-            assert child.wait(30.0) == 0

@@ -14,13 +14,13 @@ import pytest
 
 from support.relay_rig import FLEET, ROBOT, TASK, Application, Reports, Rig, slot
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import Bequest, RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import RelayChanged, SlotReady
 from zsched.core.relay_protocol import RelayStarted
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import OnCrash, RoutePhase, Slot, StreamClass
-from zsched.ipc.takeover import Door
 from zsched.sessions.config import client_config, data_config, local_config
+from zsched_lab.fleet.relays import hello_of
 
 HZ = 100.0
 TIMES = 3
@@ -39,15 +39,12 @@ class Host(Rig):
         if node != ROBOT:
             return super().handle(node, text)
         self.daemons += 1
-        door = Door(self.folder, ROBOT)
         return RelayHandle(
-            fleet=FLEET,
-            node=ROBOT,
+            hello=hello_of(FLEET, ROBOT, threads=self.threads, tasks=self.tasks),
+            path=self.folder / f"{ROBOT}.relay",
             zenoh_config=text,
             on_report=self.reports[ROBOT].add,
-            threads=self.threads,
             local_config=local_config(LocalSide(mode=LocalMode.PEER, listen=(self.side,))),
-            bequest=Bequest(door=door, orphan_s=20.0, incarnation=self.daemons, digest="", tasks=self.tasks),
         )
 
     def text(self) -> str:
@@ -59,7 +56,7 @@ class Host(Rig):
         return client_config(connect=(self.side,), connect_s=20.0)
 
     def begin_anew(self, plan: Slot) -> None:
-        """Another daemon, whose data session is configured otherwise, takes the relay over and plans as before."""
+        """Another daemon, whose data session is configured otherwise, comes to the relay and plans as before."""
         self.relays[ROBOT].leave()
         self.reports[ROBOT] = Reports()
         self.relays[ROBOT] = self.handle(ROBOT, self.text())

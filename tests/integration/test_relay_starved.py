@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +17,7 @@ from zsched.core.relay_protocol import HandleReport
 from zsched.errors import AdapterError
 from zsched.sessions.config import data_config
 from zsched_lab.fleet.groups import LimitedGroup
+from zsched_lab.fleet.relays import hello_of
 
 pytestmark = pytest.mark.long
 
@@ -23,7 +25,9 @@ CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 
 
 @pytest.mark.root
-def test_a_relay_that_starts_with_next_to_no_processor_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relay_that_starts_with_next_to_no_processor_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """About a hundredth of a core: it takes 10 s and more to start, and nobody kills it meanwhile; status says why."""
     try:
         group = LimitedGroup.create(f"zsched-starved-{os.getpid()}", cpu_cores=0.04)
@@ -32,7 +36,9 @@ def test_a_relay_that_starts_with_next_to_no_processor_is_left_alone(monkeypatch
     monkeypatch.setattr(streams, "START_S", 0.5)
     monkeypatch.setattr(streams, "STARVED_S", 1.0)
     reports: list[HandleReport] = []
-    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append)
+    handle = RelayHandle(
+        hello=hello_of("test", "robot1"), path=tmp_path / "relay", zenoh_config=CONFIG, on_report=reports.append
+    )
     rivals = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
     for rival in rivals:  # the kernel gives a group a little more than so small a share
         group.add(rival.pid)

@@ -29,6 +29,7 @@ from zsched.sessions.config import client_config, data_config, local_config, wor
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.fleet.relays import hello_of
 
 CONFIG = Path(__file__).parents[2] / "configs" / "ros2.yaml"
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
@@ -46,7 +47,7 @@ def opened(text: str, **more: str) -> zenoh.Session:
 class Host:
     """A robot: a router, a node with a latched /map, listeners to the results, the relay."""
 
-    def __init__(self, stack: contextlib.ExitStack, name: str, listen: str, seed: str) -> None:
+    def __init__(self, stack: contextlib.ExitStack, folder: Path, name: str, listen: str, seed: str) -> None:
         endpoint = free_endpoint()
         more = {"mode": '"router"', "listen/endpoints": f'["{endpoint}"]'}
         stack.callback(opened(client_config(connect=()), **more).close)
@@ -62,8 +63,8 @@ class Host:
         for topic, kind in (("merged_map", GRID), ("tf_static", TF)):
             node.declare_subscriber(f"0/{topic}/{kind}", self.heard[topic].append)
         self.relay = RelayHandle(
-            fleet="ros_fleet",
-            node=name,
+            hello=hello_of("ros_fleet", name),
+            path=folder / f"{name}.relay",
             zenoh_config=data_config(listen=(listen,), connect=() if listen == seed else (seed,), shared_memory=False),
             on_report=self.reports.append,
             local_config=local_config(LocalSide(connect=(endpoint,))),
@@ -85,10 +86,11 @@ def hosts(tmp_path: Path) -> Iterator[dict[str, Host]]:
     assert "--ros2" in task.worker.command
     seed, edge = free_endpoint(), free_endpoint()
     with contextlib.ExitStack() as stack:
-        made = {name: Host(stack, name, seed if name == ROBOTS[0] else free_endpoint(), seed) for name in ROBOTS}
+        ends = {name: seed if name == ROBOTS[0] else free_endpoint() for name in ROBOTS}
+        made = {name: Host(stack, tmp_path, name, end, seed) for name, end in ends.items()}
         relay = RelayHandle(
-            fleet="ros_fleet",
-            node="edge1",
+            hello=hello_of("ros_fleet", "edge1"),
+            path=tmp_path / "edge1.relay",
             zenoh_config=data_config(listen=(edge,), connect=(seed,), shared_memory=False),
             on_report=lambda _report: None,
         )

@@ -21,6 +21,7 @@ from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.values.fleet import LocalMode, LocalSide, Timing
 from zsched.core.values.plan import StreamClass
 from zsched.sessions.config import client_config, local_config
+from zsched_lab.fleet.relays import hello_of
 
 pytestmark = pytest.mark.long
 
@@ -50,9 +51,12 @@ class Host(Rig):
 
     def handle(self, node: str, text: str) -> RelayHandle:
         local = local_config(LocalSide(mode=LocalMode.PEER, listen=(self.side,)), timing=self.timing)
-        report = self.reports[node].add
         return RelayHandle(
-            fleet=FLEET, node=node, zenoh_config=text, on_report=report, local_config=local if node == ROBOT else ""
+            hello=hello_of(FLEET, node),
+            path=self.folder / f"{node}.relay",
+            zenoh_config=text,
+            on_report=self.reports[node].add,
+            local_config=local if node == ROBOT else "",
         )
 
     def application_config(self) -> str:

@@ -35,8 +35,9 @@ from zsched.core.values.profile import DeviceSample, LinkSource
 from zsched.core.vote.clocks import is_bad
 from zsched.errors import AdapterError
 from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
+from zsched.ipc.relay_socket import relay_pid
 from zsched.log_limit import BURST, RATE_HZ
-from zsched.paths import socket_path
+from zsched.paths import relay_path, socket_path
 from zsched.runtime.endpoints import (
     MAX_PORT,
     MIN_PORT,
@@ -424,6 +425,10 @@ if "BEGUN" not in os.environ:
     from zsched.runtime.session_watch import SessionWatch
     os.environ["BEGUN"], SessionWatch.is_due = "1", lambda *_: DUE
     sys.exit(daemon.main(sys.argv[1:]))
+from pathlib import Path
+from zsched.ipc.relay_socket import relay_pid
+for pid in filter(None, map(relay_pid, Path(sys.argv[-1]).glob("*.relay"))):
+    os.kill(pid, signal.SIGKILL)  # it has our stderr, of which the test waits for the end
 """
 
 
@@ -469,6 +474,8 @@ def place(tmp_path: Path) -> Iterator[Place]:
     for process in made.processes:
         if process.poll() is None:
             process.kill()
+            if (relay := relay_pid(relay_path(made.folder, "edge1"))) is not None:
+                os.kill(relay, signal.SIGKILL)
         process.communicate(timeout=60)
 
 
@@ -549,7 +556,6 @@ def begin_anew(place: Place, second_life: str, env: Mapping[str, str] | None = N
 
     ``due``: what tells that it is its turn.
     """
-    place.file.write_text(json.dumps(json.loads(place.file.read_text()) | {"relay_orphan_s": 0}))
     places = ["--state-dir", str(place.folder / "state"), "--runtime-dir", str(place.folder)]
     process = subprocess.Popen(
         [

@@ -69,8 +69,8 @@ def test_who_was_away_during_changes_starts_by_the_old_value_and_learns() -> Non
     assert not play.sim.node("robot3").agreement.is_elector
 
 
-@pytest.mark.parametrize("orphan_s", [FLEET.relay_orphan_s, 5.0])
-def test_a_task_that_is_added_again_is_another_one_for_who_was_away(orphan_s: float) -> None:
+@pytest.mark.parametrize("zenoh_config", ["", "z.json5"])
+def test_a_task_that_is_added_again_is_another_one_for_who_was_away(zenoh_config: str) -> None:
     """Its streams do not go on to the owner of the task before, also when the document is the same one again."""
     play = Play()
     play.adopt()
@@ -79,7 +79,7 @@ def test_a_task_that_is_added_again_is_another_one_for_who_was_away(orphan_s: fl
     play.settle(20)
     assert play.sim.run_until(lambda: play.sim.agreed("other") is not None, 20)
     play.sim.crash("robot3")
-    for said in (FLEET, replace(both, relay_orphan_s=orphan_s)):
+    for said in (FLEET, replace(both, zenoh_config=zenoh_config)):
         assert play.told("robot1", ChangeFleet(document=play.document(said))).outcome is CommandOutcome.OK
         tasks = said.tasks
         assert play.sim.run_until(lambda: play.sim.node("robot2").fleet.tasks == tasks, 20)  # noqa: B023 - at once
@@ -96,11 +96,11 @@ def test_a_task_that_is_added_again_is_another_one_for_who_was_away(orphan_s: fl
 def test_a_node_starts_by_its_document_and_shows_that_its_file_differs() -> None:
     play = Play()
     play.adopt()
-    other = replace(FLEET, relay_orphan_s=5.0)
+    other = replace(FLEET, zenoh_config="z.json5")
     play.sim.machines["robot1"].fleet = other
     play.sim.crash("robot1")
     play.sim.start("robot1")
-    assert play.sim.node("robot1").fleet.relay_orphan_s == FLEET.relay_orphan_s
+    assert play.sim.node("robot1").fleet.zenoh_config == FLEET.zenoh_config
     assert "zsched apply" in play.sim.node("robot1").problems["fleet/file", ""]
     play.settle(20)
     assert ("fleet/file", "") not in play.sim.node("robot2").problems
@@ -131,12 +131,12 @@ def test_a_node_whose_document_is_gone_starts_with_what_it_knows_and_fetches_it(
 def test_a_document_that_is_not_valid_here_is_shown_and_the_node_goes_on_by_its_last_one() -> None:
     play = Play()
     play.adopt()
-    document = play.document(replace(FLEET, relay_orphan_s=5.0))
+    document = play.document(replace(FLEET, zenoh_config="z.json5"))
     play.sim.documents.unfit.add(("robot3", next(reversed(play.sim.documents.says))))
     assert play.told("robot1", ChangeFleet(document=document)).outcome is CommandOutcome.OK
     assert play.sim.run_until(lambda: ("fleet/document", "") in play.sim.node("robot3").agreement.problems, 5)
-    assert play.sim.node("robot3").fleet.relay_orphan_s == FLEET.relay_orphan_s
-    assert play.sim.run_until(lambda: play.sim.node("robot2").fleet.relay_orphan_s == 5.0, 5)
+    assert play.sim.node("robot3").fleet.zenoh_config == FLEET.zenoh_config
+    assert play.sim.run_until(lambda: play.sim.node("robot2").fleet.zenoh_config == "z.json5", 5)
     assert play.sim.node("robot3").agreement.counters["document_refused"] == 1
 
 
@@ -185,9 +185,10 @@ def test_a_fleet_that_gets_the_clocks_of_slow_links_is_changed_over_slow_links()
     assert play.told("robot1", ChangeFleet(document=play.document(slow))).outcome is CommandOutcome.OK
     play.settle(20)
     play.sim.delay_s = (0.93, 0.95)  # an answer comes after a whole round by the clocks of before
-    result = play.told("robot1", ChangeFleet(document=play.document(replace(slow, relay_orphan_s=5.0))), WAN.order_s)
+    other = play.document(replace(slow, zenoh_config="z.json5"))
+    result = play.told("robot1", ChangeFleet(document=other), WAN.order_s)
     assert result.outcome is CommandOutcome.OK
-    assert play.sim.run_until(lambda: play.sim.node("robot3").fleet.relay_orphan_s == 5.0, 10)
+    assert play.sim.run_until(lambda: play.sim.node("robot3").fleet.zenoh_config == "z.json5", 10)
 
 
 @pytest.mark.parametrize("is_cut_off", [False, True], ids=["off", "cut off"])

@@ -8,7 +8,9 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import tempfile
 from functools import partial
+from pathlib import Path
 
 import zenoh
 
@@ -22,6 +24,7 @@ from zsched.core.route.route import plan_for, slot_for
 from zsched.core.values.fleet import LocalSide
 from zsched.core.values.plan import RoutePhase, Slot
 from zsched.sessions.config import client_config, data_config, local_config
+from zsched_lab.fleet.relays import hello_of
 
 ROBOT = "robot1"
 
@@ -49,8 +52,8 @@ class RosHost:
         stack.callback(opened(client_config(connect=()), "router", self.host).close)
         self.reports = Reports()
         self._relay = RelayHandle(
-            fleet="test",
-            node=ROBOT,
+            hello=hello_of("test", ROBOT),
+            path=Path(stack.enter_context(tempfile.TemporaryDirectory())) / "relay",
             zenoh_config=data_config(listen=(self.seed,), connect=(), shared_memory=False),
             on_report=self.reports.add,
             local_config=local_config(LocalSide(connect=(self.host,))),

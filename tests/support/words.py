@@ -10,10 +10,10 @@ from hashlib import blake2s
 from typing import Any, Final, Union, get_args, get_origin
 
 from zsched.ipc.pipe import COMMANDS, REPORTS
-from zsched.ipc.protocol import RelayHello, RelayHere, RelayRefused
+from zsched.ipc.protocol import RelayHello, RelayHere, RelayQuestion, RelayRefused
 from zsched.wire import codec as wire
 
-_GREETINGS: Final[tuple[type[Any], ...]] = (RelayHello, RelayHere, RelayRefused)
+_GREETINGS: Final[tuple[type[Any], ...]] = (RelayHello, RelayQuestion, RelayHere, RelayRefused)
 
 
 def words_digest() -> str:

@@ -257,8 +257,6 @@ def _verdicts(
     before, after = (fleet.zenoh_config.rpartition("/")[2] for fleet in (old, new))
     if before != after:
         yield _restart_all("zenoh", before, after)
-    if old.relay_orphan_s != new.relay_orphan_s:
-        yield _restart_all("relay_orphan_s", old.relay_orphan_s, new.relay_orphan_s)
     for name in ("replace_s", "away_s"):
         if getattr(old, name) != getattr(new, name):
             yield _set(AT_ONCE, name, getattr(old, name), getattr(new, name))

@@ -32,7 +32,7 @@ __all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "r
 
 MORE = "note: more may follow once these are mended: what hangs on a faulty part cannot be judged"
 _SEEDS = 2
-_PLAIN = ("relay_orphan_s", "shared_memory", "replace_s", "away_s")
+_PLAIN = ("shared_memory", "replace_s", "away_s")
 """Keys of the fleet file that are fields of `Fleet` as they stand."""
 """How many nodes are seeds when the file names none: one may be down."""
 

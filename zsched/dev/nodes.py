@@ -32,7 +32,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct
 from zsched.errors import AdapterError
-from zsched.ipc.takeover import Door
+from zsched.ipc.relay_socket import relay_pid
 from zsched.runtime.init import init_state
 
 TOKEN: Final = "ZSCHED_DEV_RUN"
@@ -150,15 +150,11 @@ class Nodes:
         """End a node as a machine ends that loses its power: daemon, worker and relay at once."""
         running = self._running[node]
         running.is_stopping = True
-        relay = self._relay(node)
+        relay = relay_pid(paths.relay_path(self.folder, node))
         running.process.kill()
         if relay is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(relay, signal.SIGKILL)
-
-    def _relay(self, node: NodeId) -> int | None:
-        note = Door(self.folder, node).note()
-        return None if note is None or note.pid == 0 else note.pid
 
     def is_up(self, node: NodeId) -> bool:
         """Whether its daemon runs and has not been asked to end."""

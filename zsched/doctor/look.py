@@ -28,7 +28,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.doctor.fleet import differs
 from zsched.doctor.model import Json, Scene
 from zsched.errors import AdapterError, ConfigError, WireError
-from zsched.ipc.takeover import Door
+from zsched.ipc.relay_socket import ask_relay
 from zsched.runtime.tls import asker_in, visits
 from zsched.runtime.zenoh_file import judged
 from zsched.wire.codec import from_plain
@@ -143,9 +143,9 @@ def _sides(door: Path, node: NodeId) -> Mapping[str, str]:
 
 
 def _relay_version(folder: Path, node: NodeId) -> str:
-    """Of the relay's note."""
-    note = Door(folder, node).note()
-    return "" if note is None else note.version
+    """By its own word."""
+    here = ask_relay(places.relay_path(folder, node))
+    return "" if here is None else here.version
 
 
 def _own(door: Path) -> tuple[Json | None, str]:

@@ -2,15 +2,15 @@
 
 Knows: framing, the classes that may pass, their size bounds. Does not know: processes, zenoh, what a value leads to.
 
-A frame is 4 bytes of length (big endian) and that many bytes. The first frame to the relay is the JSON text of its
-zenoh session; every other frame is a `zsched.wire.codec` frame. A length over `MAX_FRAME` is a broken pipe, not a
-value.
+A frame is 4 bytes of length (big endian) and that many bytes. Behind a daemon's greeting are the JSON texts of the
+relay's zenoh sessions; every other frame is a `zsched.wire.codec` frame. A length over `MAX_FRAME` is a broken pipe,
+not a value.
 """
 
 from __future__ import annotations
 
 import os
-import select
+import socket
 import struct
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from zsched.wire import codec as wire
 
 MAX_FRAME: Final = 1 << 20
 _LENGTH: Final = struct.Struct(">I")
+_TIMEVAL: Final = struct.Struct("ll")
 _SMALL: Final = 8 * 1024
 
 _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
@@ -29,8 +30,9 @@ _REGISTERED: Final[tuple[tuple[str, type, int], ...]] = (
     ("task_ended", relay_protocol.TaskEnded, _SMALL),
     ("relay_started", relay_protocol.RelayStarted, _SMALL),
     ("relay_pulse", protocol.RelayPulse, _SMALL),
-    ("relay_hello", protocol.RelayHello, wire.LARGE),
-    ("relay_here", protocol.RelayHere, _SMALL),
+    ("relay_greeting", protocol.RelayHello, wire.LARGE),
+    ("relay_question", protocol.RelayQuestion, _SMALL),
+    ("relay_present", protocol.RelayHere, _SMALL),
     ("relay_refused", protocol.RelayRefused, _SMALL),
     ("worker_seen", relay_protocol.WorkerSeen, _SMALL),
     ("worker_watch", relay_protocol.WorkerWatch, wire.LARGE),
@@ -106,21 +108,11 @@ def read_frame(descriptor: int) -> bytes | None:
     return _read_exactly(descriptor, length)
 
 
-def wait_readable(descriptor: int, wakeups: int) -> None:
-    """Wait until there is something to read, or the pipe has ended; handlers of signals run meanwhile (main thread).
-
-    A signal that comes just before a plain read begins has its handler called when that read ends, perhaps never. Where
-    ``wakeups`` is the reading end of `signal.set_wakeup_fd` (not blocking) it ends the wait.
-    """
-    poller = select.poll()
-    poller.register(descriptor, select.POLLIN)
-    poller.register(wakeups, select.POLLIN)
-    while True:
-        ready = {found for found, _ in poller.poll()}
-        if wakeups in ready:
-            os.read(wakeups, 512)
-        if descriptor in ready:
-            return
+def set_timeout(link: socket.socket, seconds: float) -> None:
+    """Bound every read and write on ``link`` (0: unbounded); over it they raise `BlockingIOError`."""
+    value = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
+    for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+        link.setsockopt(socket.SOL_SOCKET, option, value)
 
 
 def encode_end(marker: relay_protocol.EndMarker) -> bytes:

@@ -1,6 +1,6 @@
 """The frozen values by which a relay knows its daemon.
 
-Knows: the greeting between a relay and the successor of its daemon, the pulse. Does not know: pipes, frames, plans.
+Knows: the greeting between a relay and its daemon, the pulse. Does not know: pipes, frames, plans.
 """
 
 from __future__ import annotations
@@ -20,37 +20,50 @@ class RelayPulse(Struct, frozen=True, kw_only=True):
 
 
 class RelayHello(Struct, frozen=True, kw_only=True):
-    """A daemon asks for the relay that another daemon left: who it is, and what it would start a relay with."""
+    """A daemon comes to its node's relay: which relay it needs, and what a relay that runs has to hear first.
 
+    The text of the data session follows, and that of the host's own side if there is one.
+    """
+
+    protocol: int
+    """`zsched.ipc.relay_socket.PROTOCOL` of the daemon."""
     fleet: str
     node: NodeId
-    incarnation: int
-    """Of the daemon's durable state: it rises with every start."""
-    digest: str
-    """Over the protocol, the host's own side and all else that a process keeps for its life (`digest_of`)."""
-    session: str = ""
-    """A digest over what its data session is opened with: access rules, certificate, addresses."""
-    threads: int = 0
-    """How many threads it needs, each to receive, to transmit, and to close links."""
+    threads: int
+    """How many threads it needs, each to receive, to transmit, and to close links..."""
+    spare_threads: int = 0
+    """...and how many more a relay begins with, for a fleet that grows."""
+    has_local_side: bool = False
+    certificate: str = ""
+    """A digest over the files that the data session reads when it opens."""
+    addresses: tuple[str, ...] = ()
+    """Without a local side: those of the host, which zenoh reads once."""
+    listen: str = ""
+    """Where the data session listens."""
     tasks: tuple[TaskId, ...] | None = None
-    """Of its fleet: what an earlier daemon's relay carries beside these has ended. ``None``: it ends nothing."""
+    """Of its fleet: what the relay carries beside these has ended. ``None``: it ends nothing."""
 
     def __post_init__(self) -> None:
         check_name("hello.fleet", self.fleet)
         check_name("hello.node", self.node)
-        check_counter("hello.incarnation", self.incarnation)
         check_counter("hello.threads", self.threads)
+        check_counter("hello.spare_threads", self.spare_threads)
+
+
+class RelayQuestion(Struct, frozen=True, kw_only=True):
+    """Somebody asks what relay runs here."""
 
 
 class RelayHere(Struct, frozen=True, kw_only=True):
-    """The relay obeys this daemon from now on."""
+    """The answer to a daemon that is obeyed from now on, and to a question."""
 
-    pid: int
-    reopens: bool = False
-    """Its data session is not the daemon's: it waits for the configuration of one, and opens that."""
+    version: str
+    """Of the program."""
+    listen: str = ""
+    """Where its data session listens."""
 
 
 class RelayRefused(Struct, frozen=True, kw_only=True):
-    """The relay is not this daemon's."""
+    """The relay is not this daemon's, or has one; in the first case it ends."""
 
     reason: str

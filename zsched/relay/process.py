@@ -1,7 +1,7 @@
-"""The relay process: its session, its threads, its pipe to the daemon.
+"""The relay process: its session, its threads, what passes between it and its daemon.
 
 Knows: how commands become tasks' plans and roles, how reports leave, how to go on without a daemon for a while, how to
-end within a second. Does not know: how a stream is carried.
+end within a second. Does not know: how a stream is carried, which daemon it obeys.
 
 Without a daemon the streams run on: plans are obeyed as they are, and what owners put out passes (an exclusive one puts
 out nothing without its lease). No worker gets a role: those of this node died with the daemon.
@@ -34,9 +34,8 @@ from zsched.core.values.plan import Role, Route, RoutePlan
 from zsched.errors import WireError
 from zsched.guard import calmed, ends_within, guarded, on_failure
 from zsched.heap import Leftovers
-from zsched.ipc.pipe import COMMANDS, read_frame, wait_readable, write_frame
-from zsched.ipc.protocol import RelayHello, RelayPulse
-from zsched.relay.books import Books
+from zsched.ipc.pipe import COMMANDS, write_frame
+from zsched.ipc.protocol import RelayPulse
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
@@ -44,10 +43,10 @@ from zsched.relay.mute_links import MuteLinks
 from zsched.relay.open_streams import OpenStreams
 from zsched.relay.roles import RoleServer
 from zsched.relay.streams.acks import DEFAULT_LEASE_S, Acks
-from zsched.relay.successors import Successor, Successors
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
+from zsched.relay.visits import Daemon, RefusedError, Visits
 from zsched.sessions.closing import ALARM_S, CLOSE_S
 from zsched.sessions.config import WORKERS_BY, lease_s, setting
 from zsched.sessions.expulsion import MAX_DATA_SESSIONS, Expulsion, Refusal, members_of
@@ -65,8 +64,6 @@ LEAVE_S: Final = 1.5
 """Before the data session is opened anew, samples under way arrive; after this time without any they are given up..."""
 LEAVE_MAX_S: Final = 8.0
 """...and in any case after this time."""
-ANEW_S: Final = 60.0
-"""How long to wait for a daemon that begins anew in its process, however slow the machine is."""
 END_S: Final = 3.0
 """The session has this time to close, and its port to be free."""
 RETRY_S: Final = 0.05
@@ -83,11 +80,11 @@ _log = logging.getLogger("zsched.relay")
 class Reporter:
     """Writes reports to the daemon from a thread of its own; when the daemon stalls, counters are the first to go.
 
-    While there is no daemon reports are dropped: `attach` tells the next one what still holds.
+    While there is no daemon reports are dropped; `attach` tells the next one what still holds.
     """
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
+    def __init__(self) -> None:
+        self._link: socket.socket | None = None
         self._queue: queue.Queue[RelayReport | None] = queue.Queue(MAX_REPORTS)
         self._writing = threading.Lock()
         self._problems: dict[str, ProblemReported] = {}
@@ -111,15 +108,20 @@ class Reporter:
         except queue.Full:
             _log.error("the daemon does not read: a report was dropped (%s)", value)
 
-    def attach(self, link: socket.socket, *, commands: int) -> None:
-        """Report to another daemon, and take ``commands`` from it; lasting problems are reported again."""
+    def attach(self, link: socket.socket) -> None:
+        """Report to a daemon from now on; lasting problems are reported again."""
         with self._writing:  # no frame may begin on one link and end on another
-            os.dup2(link.fileno(), self._descriptor)
-            os.dup2(link.fileno(), commands)
-        link.close()
+            self._link = link
         for problem in tuple(self._problems.values()):
             if problem.problem is not None:
                 self.report(problem)
+
+    def detach(self) -> None:
+        """The daemon has gone: its link is closed."""
+        with self._writing:
+            link, self._link = self._link, None
+        if link is not None:
+            link.close()
 
     def flush(self, deadline_s: float) -> None:
         """Send what is queued, for at most this long."""
@@ -147,7 +149,8 @@ class Reporter:
             _log.error("a report is too large: %s", error)
             return
         with self._writing, contextlib.suppress(OSError):  # the daemon is gone: the end of our commands says so too
-            write_frame(self._descriptor, frame)
+            if self._link is not None:
+                write_frame(self._link.fileno(), frame)
 
 
 class RelayProcess:
@@ -166,13 +169,8 @@ class RelayProcess:
         introducer: Introducer | None = None,
         link_lease_s: float = DEFAULT_LEASE_S,
         members: frozenset[str] | None = None,
-        books: Books | None = None,
     ) -> None:
-        """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any.
-
-        ``books``: with what relays before this one have counted.
-        """
-        self._books = books or Books(None)
+        """``link_lease_s``: zenoh's, on the session's links. ``members``: the common names that it lets in, if any."""
         self._session, self._fleet = session, fleet
         self._counting, self._refused = threading.Lock(), Counter[Refusal]()
         self._expulsion = self._expel_from(session, members)
@@ -195,7 +193,6 @@ class RelayProcess:
         self._troubles = Troubles(session, keyspace, node, reporter.report)
         self._tokens = Tokens(session, keyspace, self._worker_seen, self._role_ended, self._wake)
         self._token = self._shown(session)
-        reporter.report(RelayStarted(pid=os.getpid(), zid=str(session.zid())))
         guarded(self._count, name="counters").start()
         if not local_config:
             self._begin(None)
@@ -211,11 +208,11 @@ class RelayProcess:
         self._session.close()
 
     def finish(self) -> None:
-        """Take nothing more, let what is under way arrive for a moment, and write down what became of all samples."""
+        """Take nothing more, let what is under way arrive for a moment, and tell what became of all samples."""
         until = monotonic_s() + FINISH_S
         for is_done in [task.finish(until - FINISH_SPARE_S) for task in tuple(self._tasks.values())]:
             is_done.wait(max(0.0, until - monotonic_s()))
-        self._tell_counts(is_last=True)
+        self._tell_counts()
 
     def reopen(self, config: str) -> None:
         """Open the data session anew, by another configuration; the host's own side, and what comes there, stays.
@@ -284,7 +281,6 @@ class RelayProcess:
         """End what is carried for other tasks: they have left the fleet."""
         with self._lock:
             known = {*self._tasks, *self._waiting, *self._standbys, *self._unowned}
-            self._books.keep(frozenset(tasks))
         for name in sorted(known - set(tasks)):
             self._end(name)
 
@@ -303,27 +299,17 @@ class RelayProcess:
             for task, routes in self._standbys.items():
                 self._graph.set_routes(_standbys_of(task), routes)
 
-    def obey(self, commands: int, wakeups: int) -> bool:
-        """Read commands until the daemon says stop (true) or is gone (false); ``wakeups``: see `wait_readable`."""
-        while True:
-            wait_readable(commands, wakeups)
-            try:
-                frame = read_frame(commands)
-            except (WireError, OSError) as error:
-                _log.error("the daemon's pipe is broken: %s", error)
-                return False
-            if frame is None:
-                return False
-            try:
-                command = wire.decode(frame, *COMMANDS)
-            except WireError as error:
-                self._reporter.report(
-                    ProblemReported(source=SOURCE, problem=f"unreadable command: {error}"[:MAX_REASON])
-                )
-                continue
-            if isinstance(command, RelayStop):
-                return True
-            self._do(command)
+    def obey(self, frame: bytes) -> bool:
+        """Do what the daemon says; false once that is to end."""
+        try:
+            command = wire.decode(frame, *COMMANDS)
+        except WireError as error:
+            self._reporter.report(ProblemReported(source=SOURCE, problem=f"unreadable command: {error}"[:MAX_REASON]))
+            return True
+        if isinstance(command, RelayStop):
+            return False
+        self._do(command)
+        return True
 
     def go_on_alone(self) -> None:
         """The daemon is gone, and nobody says what holds: see the module's first lines."""
@@ -331,8 +317,8 @@ class RelayProcess:
         for task in tuple(self._tasks.values()):
             task.lose_daemon()
 
-    def begin_again(self) -> None:
-        """Another daemon has come, and knows nothing of us: name the workers that are there; its plans follow."""
+    def begin(self) -> None:
+        """A daemon has come, and knows nothing of us: name the workers that are there; its plans follow."""
         self._reporter.report(RelayStarted(pid=os.getpid(), zid=str(self._session.zid())))
         for seen in self._tokens.seen():
             self._reporter.report(seen)
@@ -371,7 +357,6 @@ class RelayProcess:
                 table.pop(name, None)
             if self._graph is not None:
                 self._graph.set_routes(_standbys_of(name), ())
-            self._books.forget(name)
             task = self._tasks.pop(name, None)
         if task is not None:
             task.end()
@@ -433,10 +418,9 @@ class RelayProcess:
                 self._introducer.introduce()
             self._mute_links.look(missed - {self._node}, awake_s())
 
-    def _tell_counts(self, *, is_last: bool = False) -> None:
-        own = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
-        self._books.write(own, is_last=is_last)
-        self._reporter.report(StreamsCounted(counts=self._books.added(own)))
+    def _tell_counts(self) -> None:
+        counts = tuple(count for task in tuple(self._tasks.values()) for count in task.counts())
+        self._reporter.report(StreamsCounted(counts=counts))
 
 
 def _of_thread(kind: str) -> str:
@@ -473,30 +457,15 @@ def _opened_in_time(config: str) -> zenoh.Session:
             time.sleep(RETRY_S)
 
 
-def run(
-    me: RelayHello,
-    commands: int,
-    reports: int,
-    *,
-    has_local_side: bool = False,
-    door: int | None = None,
-    orphan_s: float = 0.0,
-    parent: int = 0,
-    books: Path | None = None,
-) -> int:
-    """Serve until told to stop; the exit code: 0 stopped, 1 the session could not be opened.
+def run(visits: Visits, daemon: Daemon, alone_s: float) -> int:
+    """Serve one daemon after the other; the exit code: 0 stopped, 1 the session could not be opened.
 
-    ``books`` is where the counters of this node's relays stand.
-    ``door`` is a listening socket: through it the daemon's successor comes, within ``orphan_s`` of the daemon's end.
-    ``parent`` is that daemon's process; 0: our parent's. It may be gone before we can ask who our parent is.
+    ``alone_s``: the relay ends when no daemon has come for so long.
     """
-    reporter = Reporter(reports)
+    reporter = Reporter()
     on_failure(lambda kind, text: reporter.report(ProblemReported(source=_of_thread(kind), problem=text)))
-    text = read_frame(commands)
-    local = read_frame(commands) if has_local_side else b""
-    if text is None or local is None:
-        return 0
-    config = text.decode()
+    reporter.attach(daemon.link)
+    hello, config = daemon.hello, daemon.session
     try:
         session = _opened(config)
     except (zenoh.ZError, ValueError) as error:
@@ -506,28 +475,16 @@ def run(
         return 1
     relay = RelayProcess(
         session,
-        me.fleet,
-        me.node,
+        hello.fleet,
+        hello.node,
         reporter,
-        local.decode(),
+        daemon.local,
         Introducer(config),
         lease_s(config),
         members_of(config),
-        Books(books),  # the relay before has gone: it had our port
     )
-    successors = None if door is None else Successors(socket.socket(fileno=door), me, reopens=has_local_side)
-    wakeups, parent = _signals_wake(), parent or os.getppid()
     try:
-        while not relay.obey(commands, wakeups) and successors is not None:
-            successor = _bridge(relay, successors, orphan_s, parent)
-            if successor is None:
-                break
-            reporter.attach(successor.link, commands=commands)
-            if successor.reopens and not _reopen(relay, reporter, commands):
-                return 1
-            if successor.tasks is not None:
-                relay.keep(successor.tasks)
-            relay.begin_again()
+        return _serve(relay, reporter, visits, daemon, alone_s)
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, FINISH_S + ALARM_S)
@@ -537,56 +494,51 @@ def run(
             _log.exception("the last counts are missing")
         reporter.flush(0.1)
         ends_within(CLOSE_S, relay.close, name="close")
-    return 0
 
 
-def _signals_wake() -> int:
-    """What becomes readable with every signal that has a handler."""
-    wakeups, at_signal = os.pipe()
-    os.set_blocking(wakeups, False)
-    os.set_blocking(at_signal, False)
-    signal.set_wakeup_fd(at_signal, warn_on_full_buffer=False)
-    return wakeups
+def _serve(relay: RelayProcess, reporter: Reporter, visits: Visits, daemon: Daemon, alone_s: float) -> int:
+    while True:
+        if daemon.hello.tasks is not None:
+            relay.keep(daemon.hello.tasks)
+        relay.begin()
+        if _obey(relay, visits, daemon):
+            return 0
+        _log.warning("the daemon is gone: carrying on for %g s", alone_s)
+        reporter.detach()
+        relay.go_on_alone()
+        try:
+            following = visits.next_daemon(alone_s)
+        except RefusedError as error:
+            _log.warning("another relay is needed: %s", error)
+            return 1
+        if following is None:
+            _log.warning("no daemon came: ends")
+            return 0
+        _log.warning("another daemon has come")
+        reporter.attach(following.link)
+        if daemon.reopens(following) and not _reopen(relay, reporter, following.session):
+            return 1
+        daemon = following
 
 
-def _reopen(relay: RelayProcess, reporter: Reporter, commands: int) -> bool:
-    """Open the data session by what the daemon says first; ``False``, and told why: it cannot be."""
-    text = None
+def _obey(relay: RelayProcess, visits: Visits, daemon: Daemon) -> bool:
+    """Do what the daemon says until it says stop (true) or is gone (false)."""
     try:
-        text = read_frame(commands)
-        if text is None:
-            return False
-        relay.reopen(text.decode())
-    except (zenoh.ZError, WireError, OSError, ValueError) as error:
-        problem = f"its data session is not opened anew: {why_not_open((text or b'').decode(), error)}"
+        while (frame := visits.next_frame(daemon.link)) is not None:
+            if not relay.obey(frame):
+                return True
+    except (WireError, OSError) as error:
+        _log.error("the link to the daemon is broken: %s", error)
+    return False
+
+
+def _reopen(relay: RelayProcess, reporter: Reporter, text: str) -> bool:
+    """Open the data session by another configuration; ``False``, and told why: it cannot be."""
+    try:
+        relay.reopen(text)
+    except (zenoh.ZError, OSError, ValueError) as error:
+        problem = f"its data session is not opened anew: {why_not_open(text, error)}"
         reporter.report(ProblemReported(source=SOURCE, problem=problem[:MAX_REASON]))
         reporter.flush(CLOSE_S)
         return False
     return True
-
-
-def _wait_for_process(successors: Successors, patience_s: float, daemon: int) -> Successor | None:
-    """Wait on for who becomes the next daemon in the process of the one before."""
-    until = awake_s() + patience_s
-    while os.getppid() == daemon and awake_s() < until:
-        if (successor := successors.wait(PULSE_S)) is not None:
-            return successor
-    return None
-
-
-def _bridge(relay: RelayProcess, successors: Successors, orphan_s: float, parent: int) -> Successor | None:
-    """Carry on without a daemon until the next one comes; ``None`` when it does not."""
-    if signal.getitimer(signal.ITIMER_REAL)[0] > 0:
-        return None  # we have been told to stop
-    _log.warning("the daemon is gone: carrying on for %g s", orphan_s)
-    relay.go_on_alone()
-    before = signal.signal(signal.SIGTERM, _end)
-    successor = successors.wait(orphan_s) or _wait_for_process(successors, max(0.0, ANEW_S - orphan_s), parent)
-    signal.signal(signal.SIGTERM, before)
-    _log.warning("%s", "no daemon came: ends" if successor is None else "another daemon has taken over")
-    return successor
-
-
-def _end(_signal: int, _frame: object) -> None:
-    """Nobody else will tell us to stop."""
-    raise SystemExit(0)

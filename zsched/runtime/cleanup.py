@@ -20,7 +20,7 @@ from typing import Final
 
 from zsched.clock import monotonic_s
 from zsched.exits import EXIT_CONFIG, EXIT_LEFT, EXIT_USAGE
-from zsched.ipc.takeover import relays_in
+from zsched.ipc.relay_socket import relay_pid
 
 DEADLINE_S: Final = 1.0
 POLL_S: Final = 0.01
@@ -79,7 +79,8 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
         return 1
     relays: frozenset[int] = frozenset()
     if spares_relay(environment):
-        relays = frozenset(relays_in(Path(environment.get("RUNTIME_DIRECTORY", "/run/zsched").partition(":")[0])))
+        folder = Path(environment.get("RUNTIME_DIRECTORY", "/run/zsched").partition(":")[0])
+        relays = frozenset(pid for path in folder.glob("*.relay") if (pid := relay_pid(path)) is not None)
     if ended := end_all(group, relays | {os.getpid()}):
         print(f"left over and ended: {', '.join(map(str, ended))}", file=sys.stderr)
     return 0

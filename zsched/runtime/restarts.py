@@ -18,7 +18,6 @@ from zsched.sessions.config import pool_threads
 _FIELDS = (
     ("zenoh_config", "`zenoh: {config}`"),
     ("shared_memory", "`shared_memory`"),
-    ("relay_orphan_s", "`relay_orphan_s`"),
 )
 _OWN = (
     ("listen_control", "`listen: {control}`"),

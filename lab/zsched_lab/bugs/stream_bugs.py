@@ -15,7 +15,7 @@ GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.s
 
 TASK = "zsched.relay.task"
 
-_BOOKS = ("tests/unit/relay/test_books.py",)
+_BOOKS = ("tests/unit/core/hop/test_books.py",)
 _TASK = ("tests/parts/relay/test_task.py",)
 _GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
 _GATES = ("tests/parts/relay/streams/test_gates.py",)

@@ -20,8 +20,9 @@ from typing import Any, Self
 
 import zenoh
 
+from zsched import paths as places
 from zsched.guard import guarded
-from zsched.ipc.takeover import Door
+from zsched.ipc.relay_socket import relay_pid
 from zsched.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 from zsched_lab.fleet.testbed import TASK, echo_fleet
@@ -121,8 +122,7 @@ class Openings:
 
     def relay(self) -> int | None:
         """The process id of the robot's relay."""
-        note = Door(self._folder / ROBOT / "run", ROBOT).note()
-        return None if note is None else note.pid
+        return relay_pid(places.relay_path(self._folder / ROBOT / "run", ROBOT))
 
     # --- the fleet ---------------------------------------------------------------------------------------------------
 

@@ -23,6 +23,9 @@ from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.relay_protocol import HandleReport, WorkerSeen
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, Slot, WorkerRole
+from zsched.ipc.protocol import RelayHello
+from zsched.ipc.relay_socket import PROTOCOL
+from zsched.paths import relay_path
 from zsched.sessions.config import DEFAULT_TIMING, data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.waiting import DEADLINE_S, until
@@ -31,6 +34,12 @@ Kind = TypeVar("Kind")
 FLEET, ROBOT, TASK, EDGES = "test", "robot1", "echo", ("edge1", "edge2")
 ECHO = ("-m", "zsched.tasks.echo")
 KEPT, LOOKED_AT = 20_000, 1_000
+
+
+def hello_of(fleet: str, node: str, **more: Any) -> RelayHello:
+    """What a daemon says first to its relay."""
+    said: dict[str, Any] = {"protocol": PROTOCOL, "fleet": fleet, "node": node, "threads": 6}
+    return RelayHello(**said | more)
 
 
 @dataclass
@@ -126,7 +135,12 @@ class Relays:
 
     def handle(self, node: str, text: str) -> RelayHandle:
         """The daemon's hold on a node's relay, whose data session opens by ``text``."""
-        return RelayHandle(fleet=FLEET, node=node, zenoh_config=text, on_report=self.reports[node].add)
+        return RelayHandle(
+            hello=hello_of(FLEET, node),
+            path=relay_path(self.folder, node),
+            zenoh_config=text,
+            on_report=self.reports[node].add,
+        )
 
     def endpoint(self, node: str) -> str:
         """The data endpoint of a node's relay."""

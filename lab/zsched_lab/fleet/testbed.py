@@ -32,7 +32,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import StreamCount
 from zsched.errors import AdapterError, ZschedError
-from zsched.ipc.takeover import Door
+from zsched.ipc.relay_socket import relay_pid
 from zsched.runtime.init import init_state
 from zsched.sessions import config as zenoh_config
 from zsched_lab.fleet.loopback import free_endpoint, own_address
@@ -181,8 +181,7 @@ class Testbed:
 
     def relay_pid(self, node: NodeId) -> int | None:
         """The process id of a node's relay, whichever daemon started it."""
-        note = Door(self.folder, node).note()
-        return None if note is None or note.pid == 0 else note.pid
+        return relay_pid(places.relay_path(self.folder, node))
 
     def _end_relay(self, node: NodeId, pid: int) -> None:
         with contextlib.suppress(ProcessLookupError):

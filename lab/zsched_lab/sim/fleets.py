@@ -208,7 +208,7 @@ class Schedule:
             replace(first, name=name, exclusive=False) for name in ("other", "third") if self.rng.random() < 0.4
         )
         tasks = (first, *extra)
-        said = replace(fleet, relay_orphan_s=float(self.rng.randint(1, 20)), timing=timing, tasks=tasks)
+        said = replace(fleet, zenoh_config=f"{self.rng.randint(1, 20)}.json5", timing=timing, tasks=tasks)
         base = None if value is None or not value.document else value.revision
         self._tell(ChangeFleet(document=self.sim.documents.write(said, self._flags()), base_revision=base))
         self.done["document"] += 1
@@ -398,7 +398,7 @@ class Schedule:
         while self.sim.now < until:  # operators who take machines out, a step a second, may come first
             value = self._newest()
             assert value is not None
-            said = replace(self.sim.documents.says.get(value.document, self.fleet), relay_orphan_s=99.0)
+            said = replace(self.sim.documents.says.get(value.document, self.fleet), zenoh_config="99.json5")
             base = value.revision if value.document else None
             command = ChangeFleet(document=self.sim.documents.write(said, self._flags()), base_revision=base)
             number = self._tell(command)

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import struct
-import threading
 from collections.abc import Iterator
 
 import pytest
@@ -28,7 +26,6 @@ from zsched.ipc.pipe import (
     decode_end,
     encode_end,
     read_frame,
-    wait_readable,
     write_frame,
 )
 from zsched.wire import codec as wire
@@ -94,50 +91,3 @@ def test_an_end_marker_is_read_or_is_none() -> None:
     marker = EndMarker(epoch=3, count=7)
     assert decode_end(encode_end(marker)) == marker
     assert decode_end(b"not one") is None
-
-
-@pytest.fixture
-def wakeups() -> Iterator[tuple[int, int]]:
-    """Reading and writing end, as `signal.set_wakeup_fd` wants them."""
-    ends = os.pipe()
-    for end in ends:
-        os.set_blocking(end, False)
-    before = signal.set_wakeup_fd(ends[1])
-    yield ends
-    signal.set_wakeup_fd(before)
-    for end in ends:
-        os.close(end)
-
-
-def test_a_signal_that_came_before_the_wait_ends_no_wait_for_a_frame(
-    pipe: tuple[int, int], wakeups: tuple[int, int]
-) -> None:
-    """Its handler has run; what is left of it is taken away, or every further wait would spin."""
-    os.write(wakeups[1], b"\x0f")
-    writer = threading.Timer(0.2, os.write, (pipe[1], b"x"))
-    writer.start()
-    wait_readable(pipe[0], wakeups[0])
-    assert os.read(pipe[0], 1) == b"x"
-    with pytest.raises(BlockingIOError):
-        os.read(wakeups[0], 1)
-    writer.join(10)
-
-
-def test_a_handler_that_raises_ends_the_wait(pipe: tuple[int, int], wakeups: tuple[int, int]) -> None:
-    def stop(_number: int, _frame: object) -> None:
-        raise SystemExit(0)
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, 0.1)
-    try:
-        with pytest.raises(SystemExit):
-            wait_readable(pipe[0], wakeups[0])
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def test_the_end_of_the_pipe_can_be_read(pipe: tuple[int, int], wakeups: tuple[int, int]) -> None:
-    os.close(pipe[1])
-    wait_readable(pipe[0], wakeups[0])
-    assert read_frame(pipe[0]) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
@@ -18,6 +19,8 @@ from zsched.core.values.certificates import Holder
 from zsched.core.values.fleet import Fleet, Security, StreamRule, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.plan import Direction, ReadyWhen
+from zsched.ipc.protocol import RelayHello
+from zsched.ipc.relay_socket import PROTOCOL
 from zsched.runtime.adoption import Adoption
 from zsched.runtime.endpoints import endpoints_for
 from zsched.runtime.inbox import Inbox
@@ -83,14 +86,19 @@ def test_a_task_that_was_removed_and_added_again_is_watched_again(is_another_fil
     """The relay forgets the watch with the task of before; without it no worker is seen to be ready by matching."""
     task = task_of(worker=WorkerSpec(ready_when=ReadyWhen.MATCHING), candidates=("robot1",), rules=(RULE,))
     fleet = fleet_of(task, of=("robot1", "robot2"))
-    relay = RelayHandle(fleet="hall", node="robot1", zenoh_config="{}", on_report=Mock())
+    relay = RelayHandle(
+        hello=RelayHello(protocol=PROTOCOL, fleet="hall", node="robot1", threads=6),
+        path=Path("relay"),
+        zenoh_config="{}",
+        on_report=Mock(),
+    )
     adoption = adoption_of(fleet, relay=relay)
     shell = Shell(node="robot1", inbox=Inbox(), bus=Mock(), state_file=Mock(), desk=Mock())
     shell.relay, shell.follow, shell.end = relay, adoption.follow, adoption.end
     adoption.begin()
     told = [frame for frame in relay._outbox.items.values() if isinstance(frame, WorkerWatch)]
     assert [one.task for one in told] == ["merge"]
-    more = (do.AdoptFleet(fleet=replace(fleet, relay_orphan_s=5.0)),) if is_another_file else ()
+    more = (do.AdoptFleet(fleet=replace(fleet, zenoh_config="z.json5")),) if is_another_file else ()
     shell.carry_out((*more, do.EndTask(task="merge")))
     assert list(relay._outbox.items.values())[-1] == told[0], "behind the end of the task"
     shell.carry_out((do.AdoptFleet(fleet=fleet_of(of=("robot1", "robot2"), tasks=())), do.EndTask(task="merge")))

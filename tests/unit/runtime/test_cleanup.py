@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.ipc.takeover import Door, Note, relays_in
 from zsched.runtime.cleanup import GROUPS, end_all, members, own_group, spares_relay
 
 
@@ -46,18 +45,6 @@ def test_the_own_control_group_of_either_version() -> None:
     first = "12:cpu:/x\n1:name=systemd:/system.slice/zsched.service\n0::/\n"
     assert own_group(first) == GROUPS / "systemd/system.slice/zsched.service"
     assert own_group("0::/\n") is None  # never the whole machine
-
-
-def test_the_relays_of_a_folder_are_those_that_hold_their_lock(tmp_path: Path) -> None:
-    claims = {name: Door(tmp_path, name).prepare() for name in ("robot1", "robot2")}
-    for name, claim in claims.items():
-        Door(tmp_path, name).take(claim)
-    for number, (name, claim) in enumerate(claims.items()):
-        Door(tmp_path, name).sign(claim, Note(pid=100 + number, listen=""))
-    assert relays_in(tmp_path) == (100, 101)
-    claims["robot1"].close()
-    assert relays_in(tmp_path) == (101,)
-    claims["robot2"].close()
 
 
 @pytest.fixture

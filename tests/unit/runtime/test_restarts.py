@@ -34,7 +34,6 @@ def with_node(node: NodeSpec, seeds: tuple[str, ...] = ("edge1", "edge2")) -> Fl
         (replace(OLD, timing=replace(OLD.timing, zenoh_lease_s=3.0)), "zenoh's lease (3 s"),
         (replace(OLD, shared_memory=SharedMemory.AUTO), "`shared_memory`"),
         (replace(OLD, zenoh_config="z.json5"), "`zenoh: {config}`"),
-        (replace(OLD, relay_orphan_s=3.0), "`relay_orphan_s`"),
         (with_node(replace(NODES[2], listen_control="tcp/0.0.0.0:9")), "robot1: `listen: {control}`"),
         (with_node(addressed("edge2", host="10.9.9.9")), "tcp/10.9.9.9:7457, tcp/10.9.9.9:7458 would be dialled"),
         (with_node(addressed("edge3", host="10.9.9.9")), "named under `seeds`"),

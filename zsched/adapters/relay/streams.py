@@ -1,37 +1,39 @@
-"""The daemon's handle on the relay process: takes over the one that runs or starts one, feeds it, hears its reports.
+"""The daemon's handle on its relay: connects to the one that runs, or starts one, feeds it, hears its reports.
 
-Knows: the process, its pipe, the newest plan and role of every task, when a relay counts as wedged. Does not know: what
-a plan means, zenoh.
+Knows: the socket, the greeting, the newest plan and role of every task, when a relay counts as wedged. Does not know:
+what a plan means, zenoh.
 
 Nothing here ever blocks the caller: commands wait in a table where the newest per task replaces the one before, and a
-thread writes them. A relay that dies, or is wedged, is replaced and given the newest plans and roles again. With a
-`Bequest` it outlives this daemon for a while, and the next one takes it over, streams and all; else it dies with it.
+thread writes them. A relay that is connected to is told all of the table, whatever it has carried before. One that
+dies, is wedged, or is not the one that is needed is followed by another one.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import select
+import socket
 import sys
 import threading
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from zsched import __version__
-from zsched.adapters.relay.child import ENDING_S, RelayChild, start_relay
+from zsched.adapters.relay.process import ENDING_S, RelayProcess, start_relay
 from zsched.adapters.relay.silence import Silence
 from zsched.clock import awake_s
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop, TaskEnded, WorkerWatch
-from zsched.core.values.model import MAX_REASON, NodeId, TaskId
+from zsched.core.values.model import MAX_REASON, TaskId
 from zsched.core.values.plan import Role, RoutePlan
-from zsched.core.values.struct import Struct, field
+from zsched.core.values.struct import Struct, field, replace
 from zsched.errors import AdapterError, WireError
 from zsched.guard import guarded
 from zsched.ipc.pipe import REPORTS, read_frame, write_frame
-from zsched.ipc.protocol import RelayHello, RelayPulse
-from zsched.ipc.takeover import GREETING_S, Door, digest_of
+from zsched.ipc.protocol import RelayHello, RelayHere, RelayPulse, RelayRefused
+from zsched.ipc.relay_socket import GREETING_S, dial
 from zsched.wire import codec as wire
 
 BACKOFF_MIN_S: Final = 0.1
@@ -50,8 +52,9 @@ STARVED_S: Final = 15.0
 STILL_S: Final = 8.0
 """Its streams are counted every second; after this long without a count they hang on something, though it lives."""
 EVICT_S: Final = 2.0
-WARM_S: Final = 4.0
-"""A relay that is to be replaced carries on for at most this time, until the next one has loaded its code."""
+"""A relay that is not the one that is needed ends itself within this time."""
+LOOK_S: Final = 0.02
+"""How often we look whether a relay that starts listens yet."""
 
 _log = logging.getLogger("zsched.streams")
 
@@ -91,76 +94,35 @@ class _Outbox(Struct):
             return self.items.pop(next(iter(self.items)))
 
 
-class Bequest(Struct, frozen=True, kw_only=True):
-    """How a relay passes from this daemon to the next one."""
-
-    door: Door
-    orphan_s: float
-    """The relay goes on without a daemon for this long."""
-    incarnation: int
-    """This daemon's; only a later one may take the relay over."""
-    digest: str
-    """Over everything beside sessions that a running relay must agree with (`digest_of`)."""
-    listen: str = ""
-    """Where the data session listens, for the next daemon."""
-    certificate: str = ""
-    """A digest over the files that the data session reads when it opens."""
-    tasks: tuple[TaskId, ...] | None = None
-    """Of the fleet; a relay that is taken over ends what it carries for others (``None``: it ends nothing)."""
-    spare_threads: int = 0
-    """A relay that is started gets this many more, for a fleet that grows."""
-
-
 class RelayHandle:
-    """One node's relay process. ``on_report`` is called from this handle's thread and must only enqueue."""
+    """One node's relay. ``on_report`` is called from this handle's thread and must only enqueue."""
 
     def __init__(
         self,
         *,
-        fleet: str,
-        node: NodeId,
+        hello: RelayHello,
+        path: Path,
         zenoh_config: str,
         on_report: Callable[[HandleReport], None],
-        threads: int = 6,
-        python: str = sys.executable,
         local_config: str = "",
         silence_s: float = SILENCE_S,
-        bequest: Bequest | None = None,
+        python: str = sys.executable,
     ) -> None:
-        """``zenoh_config`` is the JSON of the data session, ``threads`` the size of zenoh's pools (targets + 2).
+        """``hello`` says which relay is needed, ``path`` is the socket's.
 
-        ``local_config`` is the session of the host's own side; empty: the data session serves the host, too.
-        Without ``bequest`` the relay dies with this process. ``silence_s`` should be over zenoh's lease: a call of
-        zenoh that waits for a frozen peer may hold Python's lock that long.
+        ``zenoh_config`` is the JSON of the data session, ``local_config`` that of the host's own side; empty: the data
+        session serves the host, too. ``silence_s`` should be over zenoh's lease: a call of zenoh that waits for a
+        frozen peer may hold Python's lock that long.
         """
-        self._configs = tuple(text.encode() for text in (zenoh_config, local_config) if text)
+        self._hello = replace(hello, has_local_side=bool(local_config))
+        self._texts = tuple(text.encode() for text in (zenoh_config, local_config) if text)
         self._on_report = on_report
         self._silence_s = min(silence_s, STARVED_S)
-        self._bequest = bequest
-        self._command = [python, "-P", "-m", "zsched.relay", "--fleet", fleet, "--node", node]
-        spare = 0 if bequest is None else bequest.spare_threads
-        self._command += ["--threads", str(threads + spare), "--parent", str(os.getpid())]
-        self._command += ["--local"] if local_config else []
-        if bequest is not None:
-            digest = digest_of(bequest.digest, python, local_config)
-            session = digest_of(zenoh_config, bequest.certificate)
-            self._hello = RelayHello(
-                fleet=fleet,
-                node=node,
-                incarnation=bequest.incarnation,
-                digest=digest,
-                session=session,
-                threads=threads,
-                tasks=bequest.tasks,
-            )
-            self._command += ["--orphan", str(bequest.orphan_s), "--digest", digest, "--session", session]
-            self._command += ["--incarnation", str(bequest.incarnation), "--books", str(bequest.door.books)]
+        self._path, self._python = path, python
         self._lock = threading.Lock()
         self._newest: dict[_Key, _Told] = {}
         self._outbox = _Outbox()
-        self._relay: RelayChild | None = None
-        self._reopens = False
-        """The relay that was taken over waits for the configuration of its data session."""
+        self._relay: RelayProcess | None = None
         self._stopping = threading.Event()
         self._is_leaving = False
         self._thread = guarded(self._supervise, name="relay")
@@ -172,7 +134,7 @@ class RelayHandle:
         return relay.pid if relay is not None and not relay.has_ended() else None
 
     def start(self) -> None:
-        """Take over or start the relay; `RelayChanged` tells when it obeys."""
+        """Connect to the relay, or start one; `RelayChanged` tells when it obeys."""
         self._thread.start()
 
     def apply(self, plan: RoutePlan) -> None:
@@ -205,14 +167,11 @@ class RelayHandle:
                 relay.kill()
         if self._thread.is_alive():
             self._thread.join(max(0.5, until - awake_s()))
-        if self._bequest is not None and self._bequest.door.note() is None:
-            self._bequest.door.remove()
+        if relay is None or relay.has_ended():
+            self._path.unlink(missing_ok=True)
 
     def leave(self) -> None:
-        """Let go of the relay, which carries on for this node's next daemon; without a `Bequest` it is stopped."""
-        if self._bequest is None:
-            self.stop()
-            return
+        """Let go of the relay, which carries on for this node's next daemon."""
         self._is_leaving = True
         self._stopping.set()
         if (relay := self._relay) is not None:
@@ -229,13 +188,11 @@ class RelayHandle:
             self._outbox.put(key, value)
 
     def _supervise(self) -> None:
-        """One process after the other; this thread is their parent (PDEATHSIG counts threads) and lives on."""
+        """One relay after the other."""
         backoff = 0.0
-        found = self._take_over()
-        while found is not None or not self._stopping.is_set():
+        while not self._stopping.is_set():
             started_at = awake_s()
-            reason = self._run_once(found)
-            found = None
+            reason = self._run_once()
             if self._stopping.is_set():
                 return
             backoff = 0.0 if awake_s() - started_at > CALM_S else backoff
@@ -244,59 +201,90 @@ class RelayHandle:
             self._stopping.wait(backoff)
             backoff = min(max(BACKOFF_MIN_S, backoff * BACKOFF_FACTOR), BACKOFF_MAX_S)
 
-    def _take_over(self) -> RelayChild | None:
-        """The relay that an earlier daemon left; one that is not for us is ended, for there must be one only."""
-        bequest = self._bequest
-        note = None if bequest is None else bequest.door.note()
-        if bequest is None or note is None:
-            return None
-        silence = Silence(note.pid, GREETING_S)
-        found = bequest.door.connect(self._hello, lambda asked_s, took_s: not silence.go_on(asked_s, took_s))
-        if isinstance(found, str):
-            _log.warning("the relay that runs here (pid %d) is replaced: %s", note.pid, found)
-            return self._replaced(RelayChild(pid=note.pid, link=None, door=bequest.door))
-        link, here = found
-        self._reopens = here.reopens
-        how = ", and opens its data session anew" if here.reopens else ""
-        if note.version != __version__:
-            how += "; its code stays that of another version until the service is stopped"
-        _log.info("the relay that runs here (pid %d) is taken over%s", here.pid, how)
-        return RelayChild(pid=here.pid, link=link, door=bequest.door)
-
-    def _replaced(self, other: RelayChild) -> RelayChild | None:
-        """The relay that follows ``other``; ``None``: it could not be started yet.
-
-        The other one carries on until the next one waits for its configuration: it opens its sessions at once then, and
-        the host's applications find a relay when they dial for the second time.
-        """
-
-        def end(following: RelayChild) -> None:
-            following.speaks(WARM_S)
-            other.end(EVICT_S)
-
-        try:
-            return self._start(end)
-        except (OSError, AdapterError) as error:
-            _log.warning("the relay that is to follow does not start: %s", error)
-            other.end(EVICT_S)
-            return None
-
-    def _run_once(self, found: RelayChild | None) -> str:
+    def _run_once(self) -> str:
         """Serve one relay to its end; answers why it ended."""
         try:
-            relay = found or self._start()
+            relay = self._reach()
         except (OSError, AdapterError) as error:
-            return f"cannot start {self._command[0]}: {error}"
+            return f"cannot start {self._python}: {error}" if isinstance(error, OSError) else str(error)
         try:
             return self._serve(relay)
         except Exception as error:  # noqa: BLE001 - whatever it is: streams need a relay, and this thread its life
             _log.exception("the relay's handle failed, the relay is replaced")
             return f"its handle failed: {error!r}"
 
-    def _serve(self, relay: RelayChild) -> str:
+    def _reach(self) -> RelayProcess:
+        """A relay that obeys us: the one that listens, else one that we start.
+
+        Raises:
+            AdapterError: it does not listen, does not answer, or is not the one that is needed; it has ended then.
+            OSError: none can be started.
+        """
+        link = dial(self._path)
+        if link is None:
+            relay = self._relay = start_relay(self._python, self._path)
+            relay.meet(self._await_listener(relay))
+        else:
+            relay = self._relay = RelayProcess(0, link)
+        if reason := self._greet(relay):
+            relay.close()
+            raise AdapterError(reason)
+        return relay
+
+    def _await_listener(self, relay: RelayProcess) -> socket.socket:
+        """The link to a relay that has been started, once it listens."""
+        silence = Silence(relay.pid, START_S)
+        while (link := dial(self._path)) is None:
+            began = awake_s()
+            time.sleep(LOOK_S)
+            reason = silence.go_on(LOOK_S, awake_s() - began)
+            if relay.has_ended() or reason or self._stopping.is_set():
+                relay.kill()
+                raise AdapterError(reason or relay.ending)
+        return link
+
+    def _greet(self, relay: RelayProcess) -> str:
+        """Say who we are; answers why the relay does not obey us, or ``""``. One that does not has ended then."""
+        patience_s = 0.0
+        try:
+            for frame in (wire.encode(self._hello), *self._texts):
+                write_frame(relay.descriptor, frame)
+            self._await_answer(relay)
+            answer: RelayHere | RelayRefused | None = None
+            if (word := read_frame(relay.descriptor)) is not None:
+                answer = wire.decode(word, RelayHere, RelayRefused)  # type: ignore[assignment] # one of both
+            if isinstance(answer, RelayHere):
+                relay.wait_for_ever()
+                if answer.version != __version__:
+                    _log.info("the relay's code stays that of another version until the service is stopped")
+                return ""
+            patience_s = EVICT_S
+            reason = "it went away" if answer is None else f"another one is needed: {answer.reason}"
+        except (OSError, WireError) as error:
+            reason = f"it does not answer ({error})"
+        if not self._is_leaving and not relay.wait(patience_s):
+            relay.kill()
+        return reason
+
+    def _await_answer(self, relay: RelayProcess) -> None:
+        """Wait for the first word.
+
+        Raises:
+            TimeoutError: the relay hangs.
+        """
+        silence = Silence(relay.pid, GREETING_S)
+        poller = select.poll()
+        poller.register(relay.descriptor, select.POLLIN)
+        while True:
+            asked_s, began = silence.left_s, awake_s()
+            if poller.poll(asked_s * 1000):
+                return
+            if reason := silence.go_on(asked_s, awake_s() - began):
+                raise TimeoutError(reason)
+
+    def _serve(self, relay: RelayProcess) -> str:
         with self._lock:
             outbox = self._outbox = _Outbox(items=dict(self._newest))
-            self._relay = relay
         if self._is_leaving:
             relay.hang_up()
         if self._stopping.is_set():
@@ -316,18 +304,10 @@ class RelayHandle:
             relay.close()
         return reason or relay.ending
 
-    def _start(self, ends_other: Callable[[RelayChild], None] = lambda _next: None) -> RelayChild:
-        if self._bequest is None:
-            return start_relay(self._command)
-        return start_relay(self._command, self._bequest.door, self._bequest.listen, ends_other)
-
-    def _write(self, relay: RelayChild, outbox: _Outbox) -> None:
+    def _write(self, relay: RelayProcess, outbox: _Outbox) -> None:
         too_large: dict[tuple[str, TaskId], str] = {}
         """{what the relay was to be told: why it was not}, until something of that kind fits."""
         try:
-            texts = self._configs if relay.is_child else self._configs[: int(self._reopens)]
-            for text in texts:
-                write_frame(relay.descriptor, text)
             while (value := outbox.take()) is not None:
                 kind = (type(value).__name__, value.task)
                 try:
@@ -344,8 +324,8 @@ class RelayHandle:
         except OSError:
             return  # it is gone: the reader says so
 
-    def _listen(self, relay: RelayChild) -> str:
-        """Hand on reports until the pipe ends; answers what was wrong, or ``""``.
+    def _listen(self, relay: RelayProcess) -> str:
+        """Hand on reports until the link ends; answers what was wrong, or ``""``.
 
         A relay that cannot start says why (a problem before `RelayStarted`) and ends: that is the answer then.
         """

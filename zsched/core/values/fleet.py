@@ -454,8 +454,6 @@ class Fleet:
     """``None``: there is no `security:` section."""
     cells: tuple[Cell, ...] = ()
     """Sorted by name; the other fleets of the site, which agree on nothing with this one."""
-    relay_orphan_s: float = key(10.0, "How long a relay carries the streams on without its daemon.", Range(0, 600, "s"))
-    """The next daemon takes the relay over."""
     shared_memory: SharedMemory = key(
         SharedMemory.OFF, "Large payloads within a machine; `auto`: where the node finds it fit."
     )

@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from support.waiting import until
 from zsched.adapters.relay import streams
-from zsched.adapters.relay.child import RelayChild
+from zsched.adapters.relay.process import RelayProcess
 from zsched.adapters.relay.streams import TOO_LARGE, RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged
 from zsched.core.relay_protocol import HandleReport, RelayStarted, RelayStop
@@ -34,6 +34,7 @@ from zsched.core.values.plan import (
 from zsched.ipc.pipe import write_frame
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
+from zsched_lab.fleet.relays import hello_of
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=())
 
@@ -46,20 +47,25 @@ def is_there(pid: int) -> bool:
     return state != "Z"
 
 
+def handle_of(folder: Path, reports: list[HandleReport], **more: Any) -> RelayHandle:
+    given: dict[str, Any] = {"zenoh_config": CONFIG, "on_report": reports.append}
+    return RelayHandle(hello=hello_of("test", "robot1"), path=folder / "robot1.relay", **given | more)
+
+
 class Daemon:
     """What the handle reported."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         self.reports: list[HandleReport] = []
-        self.handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=self.reports.append)
+        self.handle = handle_of(folder, self.reports)
 
     def changes(self) -> list[bool]:
         return [report.is_running for report in tuple(self.reports) if isinstance(report, RelayChanged)]
 
 
 @pytest.fixture
-def daemon() -> Iterator[Daemon]:
-    made = Daemon()
+def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    made = Daemon(tmp_path)
     made.handle.start()
     try:
         until(lambda: made.changes() == [True], "the relay runs")
@@ -99,7 +105,7 @@ def test_a_killed_relay_is_replaced(daemon: Daemon) -> None:
     assert daemon.handle.pid != pid
 
 
-def test_a_relay_that_cannot_start_ends_with_its_own_reason() -> None:
+def test_a_relay_that_cannot_start_ends_with_its_own_reason(tmp_path: Path) -> None:
     """Also when it leaves plans unread, which resets the pipe."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -107,7 +113,7 @@ def test_a_relay_that_cannot_start_ends_with_its_own_reason() -> None:
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         config = data_config(listen=(endpoint,), connect=())
         reports: list[HandleReport] = []
-        handle = RelayHandle(fleet="test", node="robot1", zenoh_config=config, on_report=reports.append)
+        handle = handle_of(tmp_path, reports, zenoh_config=config)
         handle.set_role(Role(task="t", role=WorkerRole.ACTIVE, epoch=1))
         handle.start()
         try:
@@ -135,11 +141,14 @@ def test_a_wedged_relay_is_replaced(daemon: Daemon) -> None:
 SILENT = """#!{python}
 import os, sys, time
 sys.path[:0] = {path!r}
+from pathlib import Path
 from zsched.wire import codec as wire
 from zsched.core.relay_protocol import RelayStarted
 from zsched.ipc.pipe import write_frame
+from zsched.relay.visits import Visits
+link = Visits(Path(sys.argv[-1])).next_daemon(60).link
 while True:
-    write_frame(1, wire.encode(RelayStarted(pid=os.getpid(), zid="1")))
+    write_frame(link.fileno(), wire.encode(RelayStarted(pid=os.getpid(), zid="1")))
     end = time.monotonic() + 3.0
     while time.monotonic() < end:
         {deed}
@@ -153,9 +162,7 @@ def test_only_a_silent_relay_that_wants_no_processor_is_wedged(tmp_path: Path, d
     program.write_text(SILENT.format(python=sys.executable, path=sys.path, deed=deed))
     program.chmod(0o755)
     reports: list[HandleReport] = []
-    handle = RelayHandle(
-        fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append, python=str(program)
-    )
+    handle = handle_of(tmp_path, reports, python=str(program))
     handle.start()
     try:
         until(lambda: sum(isinstance(report, RelayChanged) for report in reports) >= 2, "it speaks again, or is gone")
@@ -165,24 +172,26 @@ def test_only_a_silent_relay_that_wants_no_processor_is_wedged(tmp_path: Path, d
         handle.stop(0.5)
 
 
-def test_a_report_of_an_unknown_kind_is_passed_over() -> None:
+def test_a_report_of_an_unknown_kind_is_passed_over(tmp_path: Path) -> None:
     """A relay that was started after the program's files were replaced is newer than its daemon."""
     ours, theirs = socket.socketpair()
     reports: list[HandleReport] = []
-    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append)
+    handle = handle_of(tmp_path, reports)
     for frame in (wire.encode(RelayStop()), wire.encode(RelayStarted(pid=7, zid="1"))):
         write_frame(theirs.fileno(), frame)
     theirs.close()
-    relay = RelayChild(pid=os.getpid(), link=ours, is_child=True)
+    relay = RelayProcess(os.getpid(), ours)
     assert handle._listen(relay) == ""
     assert [type(report).__name__ for report in reports] == ["RelayChanged", "RelayStarted"]
     relay.close()
 
 
-def test_a_relay_that_is_wedged_before_its_first_word_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relay_that_is_wedged_before_its_first_word_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(streams, "START_S", 0.5)
     reports: list[HandleReport] = []
-    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append)
+    handle = handle_of(tmp_path, reports)
     handle.start()
     try:
         os.kill(until(lambda: handle.pid, "a process"), signal.SIGSTOP)
@@ -216,14 +225,13 @@ zenoh.open = late
 """
 
 
-def changes_with(program: Path, deed: str, seconds: float) -> list[RelayChanged]:
+def changes_with(folder: Path, deed: str, seconds: float) -> list[RelayChanged]:
     """What is heard of a relay whose process does ``deed`` first, until so long after it runs."""
+    program = folder / "program"
     program.write_text(RELAY.format(python=sys.executable, path=sys.path, deed=deed))
     program.chmod(0o755)
     reports: list[HandleReport] = []
-    handle = RelayHandle(
-        fleet="test", node="robot1", zenoh_config=CONFIG, on_report=reports.append, python=str(program)
-    )
+    handle = handle_of(folder, reports, python=str(program))
     handle.start()
     try:
         until(lambda: any(isinstance(report, RelayChanged) for report in reports), "it runs, or is replaced")
@@ -235,21 +243,21 @@ def changes_with(program: Path, deed: str, seconds: float) -> list[RelayChanged]
 
 def test_a_healthy_relay_stays_when_its_machine_was_suspended(tmp_path: Path) -> None:
     """Boot time is a minute later every 0.7 s, as the kernel shows it after a suspend; all else goes on."""
-    assert [one.is_running for one in changes_with(tmp_path / "relay", SUSPENDED, 5.0)] == [True]
+    assert [one.is_running for one in changes_with(tmp_path, SUSPENDED, 5.0)] == [True]
 
 
 def test_a_relay_whose_session_opens_slowly_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(streams, "STILL_S", 1.0)
-    assert [one.is_running for one in changes_with(tmp_path / "relay", SLOW_TO_OPEN, 0.5)] == [True]
+    assert [one.is_running for one in changes_with(tmp_path, SLOW_TO_OPEN, 0.5)] == [True]
 
 
 def test_a_relay_whose_session_never_opens_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(streams, "OPEN_S", 1.0)
-    changes = changes_with(tmp_path / "relay", SLOW_TO_OPEN.replace("3.0", "60.0"), 0.0)
+    changes = changes_with(tmp_path, SLOW_TO_OPEN.replace("3.0", "60.0"), 0.0)
     assert "its session does not open" in changes[0].reason
 
 
-def test_a_handle_that_fails_replaces_the_relay_and_goes_on() -> None:
+def test_a_handle_that_fails_replaces_the_relay_and_goes_on(tmp_path: Path) -> None:
     """Whatever the daemon's own side raises, its streams have a relay again, and it is told."""
     reports: list[HandleReport] = []
 
@@ -259,7 +267,7 @@ def test_a_handle_that_fails_replaces_the_relay_and_goes_on() -> None:
             raise RuntimeError("a bug")
         reports.append(report)
 
-    handle = RelayHandle(fleet="test", node="robot1", zenoh_config=CONFIG, on_report=take)
+    handle = handle_of(tmp_path, reports, on_report=take)
     handle.start()
     try:
         until(lambda: sum(isinstance(one, RelayStarted) for one in reports) == 2, "another relay")
@@ -279,27 +287,3 @@ def test_a_stopped_relay_never_blocks_the_daemon(daemon: Daemon) -> None:
     daemon.handle.stop(0.5)
     assert time.monotonic() - started < 60.0
     assert not is_there(pid)
-
-
-def test_the_relay_dies_with_its_daemon_without_a_bequest() -> None:
-    script = (
-        "import sys, time\n"
-        "from zsched.adapters.relay.streams import RelayHandle\n"
-        "handle = RelayHandle(fleet='test', node='robot1', zenoh_config=sys.argv[1], on_report=lambda r: None)\n"
-        "handle.start()\n"
-        "while handle.pid is None: time.sleep(0.01)\n"
-        "print(handle.pid, flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", script, CONFIG], stdout=subprocess.PIPE)
-    try:
-        assert parent.stdout is not None
-        pid = int(parent.stdout.readline())
-        time.sleep(0.3)
-        assert is_there(pid)
-    finally:
-        parent.kill()
-        parent.wait(60)
-        if parent.stdout is not None:
-            parent.stdout.close()
-    until(lambda: not is_there(pid), "the relay is gone too")

@@ -36,6 +36,7 @@ from zsched.sessions.config import data_config, worker_config
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched_lab.fleet.relays import hello_of
 
 _FLEET, _TASK, _ROBOT, _EDGE, _EPOCH = "test", "map_merge", "robot1", "edge1", 3
 View = Callable[[tuple[float, float, float, float], Pose2], Grid]
@@ -60,6 +61,7 @@ class _Rig:
     """The relays of one robot and one edge, the edge's worker, and an application beside the robot."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
+        self.folder = folder
         self.reports: list[HandleReport] = []
         robot, edge = free_endpoint(), free_endpoint()
         self.relays = {
@@ -71,12 +73,13 @@ class _Rig:
         config.write_text(worker_config(connect=(edge,), shared_memory=False))
         self.worker = self._start_worker(config, arguments)
 
-    @staticmethod
     def _relay(
-        node: str, listen: str, connect: tuple[str, ...], on_report: Callable[[HandleReport], None]
+        self, node: str, listen: str, connect: tuple[str, ...], on_report: Callable[[HandleReport], None]
     ) -> RelayHandle:
         config = data_config(listen=(listen,), connect=connect, shared_memory=False)
-        handle = RelayHandle(fleet=_FLEET, node=node, zenoh_config=config, on_report=on_report)
+        handle = RelayHandle(
+            hello=hello_of(_FLEET, node), path=self.folder / f"{node}.relay", zenoh_config=config, on_report=on_report
+        )
         handle.start()
         return handle
 

@@ -48,7 +48,7 @@ NAMES = ("edge1", "robot1", "robot2", "robot3")
 ROBOTS = NAMES[1:]
 TASK = task_of(candidates=NAMES, exclusive=True)
 FLEET = fleet_of(TASK, of=NAMES, electors=ROBOTS)
-SAID = replace(FLEET, relay_orphan_s=5.0)
+SAID = replace(FLEET, zenoh_config="z.json5")
 FIRST = founded(FLEET.name, 0, ROBOTS)
 ADOPT = AdoptDocument(base_revision=1, document="0d", tasks=(("merge", True),), lease_s=1.0)
 ADOPTED = replace(ADOPT.apply(FIRST), settled=True)
@@ -407,7 +407,7 @@ def test_a_node_that_has_lost_its_document_goes_on_and_asks_for_it() -> None:
 def test_the_agreed_electors_and_lease_are_in_force_and_not_the_document_s() -> None:
     value = replace(ADOPTED, electors=ADOPTED.electors[1:], lease_s=0.7)
     fleet = in_force(SAID, value)
-    assert (fleet.electors, fleet.timing.lease_s, fleet.relay_orphan_s) == (("robot2", "robot3"), 0.7, 5.0)
+    assert (fleet.electors, fleet.timing.lease_s, fleet.zenoh_config) == (("robot2", "robot3"), 0.7, "z.json5")
 
 
 # --- commands --------------------------------------------------------------------------------------------------------

@@ -337,8 +337,11 @@ SAMPLES: dict[str, object] = {
     "relay_stop": relay_protocol.RelayStop(),
     "task_ended": relay_protocol.TaskEnded(task="map_merge"),
     "relay_pulse": protocol.RelayPulse(counted_s=0.5),
-    "relay_hello": protocol.RelayHello(fleet="warehouse", node="robot1", incarnation=3, digest="0123456789abcdef"),
-    "relay_here": protocol.RelayHere(pid=4711),
+    "relay_greeting": protocol.RelayHello(
+        protocol=3, fleet="warehouse", node="robot1", threads=12, listen="tcp/0.0.0.0:7448", tasks=("map_merge",)
+    ),
+    "relay_question": protocol.RelayQuestion(),
+    "relay_present": protocol.RelayHere(version="1.4.0", listen="tcp/0.0.0.0:7448"),
     "relay_refused": protocol.RelayRefused(reason="it is not ours"),
     "relay_started": relay_protocol.RelayStarted(pid=4711, zid="a1b2c3"),
     "worker_seen": relay_protocol.WorkerSeen(node="edge1", task="map_merge", incarnation="3-1", is_present=True),

@@ -1,4 +1,4 @@
-"""A relay outlives its daemon for a while, and the next daemon takes it over: the right one, and only one."""
+"""A relay outlives its daemon for a while, and the next daemon connects to it: the right one, and only one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,32 +18,32 @@ import pytest
 import zsched
 from support.waiting import until
 from zsched.adapters.relay import silence as relay_silence
-from zsched.adapters.relay.child import RelayChild
-from zsched.adapters.relay.streams import Bequest, RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.events import ProblemReported, RelayChanged, StreamsCounted
 from zsched.core.relay_protocol import HandleReport
 from zsched.core.values.plan import RoutePhase, RoutePlan
 from zsched.ipc.pipe import read_frame, write_frame
-from zsched.ipc.protocol import RelayHello
-from zsched.ipc.takeover import GREETING_S, PROTOCOL, Door, digest_of
+from zsched.ipc.protocol import RelayHere, RelayRefused
+from zsched.ipc.relay_socket import GREETING_S, PROTOCOL, ask_relay, relay_pid
 from zsched.sessions.config import data_config
 from zsched.wire import codec as wire
+from zsched_lab.fleet.relays import hello_of
 
 CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=(), shared_memory=False)
 OTHER_CONFIG = data_config(listen=("tcp/127.0.0.1:0",), connect=("tcp/127.0.0.1:1",), shared_memory=False)
-ORPHAN_S = 5.0
 
 FIRST_DAEMON = """
 import sys, time
 from pathlib import Path
-from zsched.adapters.relay.streams import Bequest, RelayHandle
+from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.relay_protocol import RelayStarted
-from zsched.ipc.takeover import Door
-config, folder, orphan_s = sys.argv[1], Path(sys.argv[2]), float(sys.argv[3])
-bequest = Bequest(door=Door(folder, "robot1"), orphan_s=orphan_s, incarnation=7, digest="fleet", listen="tcp/h:1")
+from zsched.ipc.protocol import RelayHello
+from zsched.ipc.relay_socket import PROTOCOL
+config, path = sys.argv[1], Path(sys.argv[2])
+hello = RelayHello(protocol=PROTOCOL, fleet="test", node="robot1", threads=6, listen="tcp/h:1")
 started = []
 handle = RelayHandle(
-    fleet="test", node="robot1", zenoh_config=config, bequest=bequest,
+    hello=hello, path=path, zenoh_config=config,
     on_report=lambda report: started.append(report) if isinstance(report, RelayStarted) else None,
 )
 handle.start()
@@ -54,6 +53,10 @@ sys.stdin.readline()
 handle.leave()
 print("left", flush=True)
 """
+
+
+def path_in(folder: Path) -> Path:
+    return folder / "robot1.relay"
 
 
 def is_there(pid: int) -> bool:
@@ -66,10 +69,10 @@ def is_there(pid: int) -> bool:
 class First:
     """A daemon in a process of its own; its relay is left to the test."""
 
-    def __init__(self, folder: Path, orphan_s: float = ORPHAN_S, package: Path | None = None) -> None:
+    def __init__(self, folder: Path, package: Path | None = None) -> None:
         """``package``: where the code is that it runs, when not this one's."""
         env = os.environ if package is None else os.environ | {"PYTHONPATH": str(package)}
-        command = [sys.executable, "-c", FIRST_DAEMON, CONFIG, str(folder), str(orphan_s)]
+        command = [sys.executable, "-c", FIRST_DAEMON, CONFIG, str(path_in(folder))]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=package, env=env
         )
@@ -98,17 +101,18 @@ class Second:
     """The next daemon of a node, in this process."""
 
     def __init__(self, folder: Path, *, config: str = CONFIG, fleet: str = "test", **changes: Any) -> None:
-        bequest = Bequest(door=Door(folder, "robot1"), orphan_s=ORPHAN_S, incarnation=8, digest="fleet")
         self.reports: list[HandleReport] = []
         self.handle = RelayHandle(
-            fleet=fleet,
-            node="robot1",
+            hello=hello_of(fleet, "robot1", **changes),
+            path=path_in(folder),
             zenoh_config=config,
             on_report=self.reports.append,
-            bequest=replace(bequest, **changes),
         )
         self.handle.start()
-        until(lambda: any(isinstance(report, RelayChanged) for report in self.reports), "a relay")
+        until(lambda: any(one.is_running for one in self.changes()), "a relay")
+
+    def changes(self) -> list[RelayChanged]:
+        return [report for report in tuple(self.reports) if isinstance(report, RelayChanged)]
 
 
 @pytest.fixture
@@ -121,71 +125,65 @@ def first(tmp_path: Path) -> Iterator[First]:
 
 
 @pytest.mark.parametrize("end", [First.crash, First.leave], ids=["crashed", "restarted"])
-def test_the_next_daemon_takes_the_relay_over(first: First, tmp_path: Path, end: Callable[[First], None]) -> None:
+def test_the_next_daemon_goes_on_with_the_relay(first: First, tmp_path: Path, end: Callable[[First], None]) -> None:
     end(first)
     second = Second(tmp_path)
     try:
         assert second.handle.pid == first.relay
-        assert [report.is_running for report in second.reports if isinstance(report, RelayChanged)] == [True]
+        assert [one.is_running for one in second.changes()] == [True]
         until(lambda: first.zid in str(second.reports), "its session is the very same")
     finally:
         second.handle.stop(2.0)
     assert not is_there(first.relay)
-    assert Door(tmp_path, "robot1").note() is None
+    assert relay_pid(path_in(tmp_path)) is None
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    "other",
-    [{"fleet": "other"}, {"incarnation": 7}, {"digest": "another fleet file"}, {"config": OTHER_CONFIG}],
-    ids=["foreign fleet", "stale daemon", "changed fleet file", "other sessions"],
+    ("other", "why"),
+    [
+        ({"fleet": "other"}, "it is other/robot1, this is the relay of test/robot1"),
+        ({"threads": 7}, "7 threads are needed, this relay has 6"),
+        ({"addresses": ("192.0.2.1",)}, "the host's own side, or its addresses"),
+        ({"config": OTHER_CONFIG}, "its data session is another one"),
+        ({"certificate": "renewed"}, "its data session is another one"),
+        ({"protocol": PROTOCOL + 1}, f"its protocol is {PROTOCOL + 1}, this relay's is {PROTOCOL}"),
+    ],
+    ids=["foreign fleet", "more threads", "addresses", "sessions", "certificate", "protocol"],
 )
-def test_a_relay_that_is_not_ours_is_replaced_never_doubled(
-    first: First, tmp_path: Path, other: dict[str, Any]
+def test_a_relay_that_is_not_the_one_that_is_needed_is_replaced_never_doubled(
+    first: First, tmp_path: Path, other: dict[str, Any], why: str
 ) -> None:
+    """By a relay of its own version in the last case, too, which has the same protocol as this test's."""
     first.crash()
-    second = Second(tmp_path, **other)
+    changes = dict(other)
+    if changes.pop("protocol", None):
+        answer = said_to(tmp_path, wire.encode(hello_of("test", "robot1", **other)), CONFIG.encode())
+        assert answer == RelayRefused(reason=why)
+        until(lambda: not is_there(first.relay), "it has ended")
+    second = Second(tmp_path, **changes)
     try:
         assert second.handle.pid != first.relay
         assert not is_there(first.relay)
-        note = Door(tmp_path, "robot1").note()
-        assert note is not None
-        assert note.pid == second.handle.pid
+        assert relay_pid(path_in(tmp_path)) == second.handle.pid
+        if changes:
+            assert why in second.changes()[0].reason
     finally:
         second.handle.stop(2.0)
 
 
-def test_a_relay_that_is_replaced_carries_on_until_the_next_one_is_ready(
-    first: First, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So the host's applications are without one for a moment only."""
-    seen: list[tuple[bool, bool]] = []
-    followers: list[RelayChild] = []
-    end, speaks = RelayChild.end, RelayChild.speaks
-
-    def speaking(child: RelayChild, timeout_s: float) -> bool:
-        followers.append(child)
-        return speaks(child, timeout_s)
-
-    def ending(child: RelayChild, timeout_s: float) -> None:
-        seen.append((is_there(first.relay), bool(followers) and speaks(followers[0], 0.0)))
-        end(child, timeout_s)
-
-    monkeypatch.setattr(RelayChild, "speaks", speaking)
-    monkeypatch.setattr(RelayChild, "end", ending)
-    first.crash()
-    second = Second(tmp_path, digest="another fleet file")
-    try:
-        assert seen == [(True, True)], "it is there, and the next one has said its first word"
-        assert second.handle.pid == followers[0].pid
-        assert not is_there(first.relay)
-    finally:
-        second.handle.stop(2.0)
-    assert list(tmp_path.iterdir()) == []
+def said_to(folder: Path, *frames: bytes) -> Any:
+    """What the relay answers to these."""
+    with socket.socket(socket.AF_UNIX) as link:
+        link.connect(str(path_in(folder)))
+        for frame in frames:
+            write_frame(link.fileno(), frame)
+        answer = read_frame(link.fileno())
+    return None if answer is None else wire.decode(answer, RelayHere, RelayRefused)
 
 
 OTHER_CODE = ("relay/task.py", "", "# a line more\n")
-OTHER_PROTOCOL = ("ipc/takeover.py", f"PROTOCOL: Final = {PROTOCOL}\n", f"PROTOCOL: Final = {PROTOCOL - 1}\n")
+OTHER_PROTOCOL = ("ipc/relay_socket.py", f"PROTOCOL: Final = {PROTOCOL}\n", f"PROTOCOL: Final = {PROTOCOL - 1}\n")
 
 
 @pytest.fixture
@@ -202,9 +200,8 @@ def older(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[First]:
     run.mkdir()
     first = First(run, package=tmp_path / "code")
     try:
-        note = Door(run, "robot1").note()
-        assert note is not None
-        assert note.version == "0+older", "who asks learns of what version it is"
+        here = ask_relay(path_in(run))
+        assert here == RelayHere(version="0+older", listen="tcp/h:1"), "who asks learns of what version it is"
         first.crash()
         shutil.rmtree(tmp_path / "code")
         yield first
@@ -226,6 +223,7 @@ def test_a_relay_of_another_version_goes_on_if_its_protocol_is_the_same(
         second.handle.apply(plan)
         until(lambda: any(isinstance(report, StreamsCounted) for report in second.reports), "it counts streams")
         assert not [one for one in second.reports if isinstance(one, ProblemReported)], second.reports
+        assert [one.is_running for one in second.changes()] == ([True] if stays else [False, True])
         assert (second.handle.pid == older.relay) is stays
     finally:
         second.handle.stop(2.0)
@@ -260,23 +258,11 @@ def test_a_wedged_orphan_is_replaced(first: First, tmp_path: Path) -> None:
         second.handle.stop(2.0)
 
 
-def test_an_orphan_ends_by_itself(tmp_path: Path) -> None:
-    first = First(tmp_path, orphan_s=0.5)
-    try:
-        first.crash()
-        assert is_there(first.relay)
-        until(lambda: not is_there(first.relay), "the orphan has ended")
-    finally:
-        first.close()
-
-
 def test_an_orphan_obeys_sigterm_at_once(first: First, tmp_path: Path) -> None:
     first.crash()
-    stranger = RelayHello(fleet="other", node="robot1", incarnation=99, digest="")
-    door = Door(tmp_path, "robot1")
-    until(lambda: "this is the relay of test/robot1" in str(door.connect(stranger)), "it knows that it is an orphan")
     os.kill(first.relay, signal.SIGTERM)
     until(lambda: not is_there(first.relay), "the orphan has ended")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_daemon_that_stops_takes_its_relay_with_it(tmp_path: Path) -> None:
@@ -288,35 +274,30 @@ def test_a_daemon_that_stops_takes_its_relay_with_it(tmp_path: Path) -> None:
 
 
 def test_a_relay_with_a_daemon_lets_no_other_in(first: First, tmp_path: Path) -> None:
-    digest = digest_of("fleet", sys.executable, "")
-    hello = RelayHello(fleet="test", node="robot1", incarnation=9, digest=digest, session=digest_of(CONFIG, ""))
-    found = Door(tmp_path, "robot1").connect(hello)
-    assert isinstance(found, str)
-    assert "does not answer" in found
-    assert first.process.poll() is None
+    greeting = (wire.encode(hello_of("test", "robot1")), CONFIG.encode())
+    assert said_to(tmp_path, *greeting) == RelayRefused(reason="it has a daemon")
+    assert ask_relay(path_in(tmp_path)) is not None, "who only asks is answered"
+    assert is_there(first.relay)
     first.crash()
-    link, here = until(lambda: _taken(tmp_path, hello), "the same is welcome once the daemon is gone")
-    assert here.pid == first.relay
-    link.close()
+    assert isinstance(said_to(tmp_path, *greeting), RelayHere), "the same is welcome once the daemon is gone"
 
 
-def _taken(folder: Path, hello: RelayHello) -> Any:
-    found = Door(folder, "robot1").connect(hello)
-    return None if isinstance(found, str) else found
-
-
-def test_garbage_at_the_door_is_refused_and_survived(first: First, tmp_path: Path) -> None:
+def test_who_only_looks_or_says_nothing_is_survived(first: First, tmp_path: Path) -> None:
     first.crash()
-    for frame in (b"", b"garbage", wire.encode(RelayHello(fleet="test", node="robot1", incarnation=99, digest=""))):
-        with socket.socket(socket.AF_UNIX) as link:
-            link.settimeout(3.0)
-            link.connect(str(tmp_path / "robot1.relay"))
-            link.settimeout(None)
-            write_frame(link.fileno(), frame)
-            while read_frame(link.fileno()) is not None:
-                pass
-    second = Second(tmp_path)
+    for _ in range(100):
+        assert relay_pid(path_in(tmp_path)) == first.relay
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.connect(str(path_in(tmp_path)))
+        second = Second(tmp_path)
     try:
         assert second.handle.pid == first.relay
     finally:
         second.handle.stop(2.0)
+
+
+def test_words_of_another_time_mean_another_relay(first: First, tmp_path: Path) -> None:
+    """A greeting that it cannot read is a daemon's of another protocol."""
+    first.crash()
+    answer = said_to(tmp_path, b"garbage")
+    assert isinstance(answer, RelayRefused)
+    until(lambda: not is_there(first.relay), "it has ended")
