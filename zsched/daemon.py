@@ -71,7 +71,7 @@ from zsched.runtime.reload import Reload
 from zsched.runtime.restoring import Restored, Stored, read_stored, restore
 from zsched.runtime.sampler import Sampler
 from zsched.runtime.sealing import seals_of
-from zsched.runtime.secured import digest_of, require_own
+from zsched.runtime.secured import CREDENTIALS, digest_of, require_own
 from zsched.runtime.session_watch import SessionWatch
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Shell
@@ -89,6 +89,8 @@ LOOP_MAX_WAIT_S = 1.0
 SPARE_NODES = 2
 """A relay is carried on while its fleet grows by at most this many nodes."""
 STDERR = 2
+RELAY = "ZSCHED_RELAY"
+"""The socket of a relay that somebody else starts, as a unit of systemd does."""
 RESTART_SIGNAL = signal.SIGUSR2
 """As SIGTERM, but the relay stays and carries the streams on for the daemon that follows (`systemctl restart`)."""
 RELOAD_SIGNAL = signal.SIGHUP
@@ -129,7 +131,8 @@ class Daemon:
         self._sleeps = SleepWatch()
         self._certificate = ""
         """Digest of the certificate that open sessions listen with."""
-        self._relay_path = places.relay_path(options.runtime_dir, options.node)
+        unit = os.environ.get(RELAY)
+        self._relay_path = Path(unit) if unit else places.relay_path(options.runtime_dir, options.node)
         self._is_ready = False
         self._library = Library(
             fleet=self._fleet.name,
@@ -363,11 +366,13 @@ class Daemon:
             certificate="" if fleet.security is None else digest_of(fleet.security),
             addresses=() if self._spec.local else self._watch.gossiped,
             listen=points.data_listen[0],
+            credentials=os.environ.get(CREDENTIALS, ""),
             tasks=tasks,
         )
         return RelayHandle(
             hello=hello,
             path=self._relay_path,
+            starts=RELAY not in os.environ,
             zenoh_config=zenoh_config.data_config(
                 listen=self._data_listen(points),
                 connect=points.data_connect,

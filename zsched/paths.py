@@ -133,8 +133,9 @@ def socket_path(runtime: Path, node: NodeId) -> Path:
 
 
 def relay_path(runtime: Path, node: NodeId) -> Path:
-    """The socket at which one node's relay waits for its daemon."""
-    return runtime / f"{node}.relay"
+    """The socket at which one node's relay waits for its daemon: the unit's, if there is one, knows of no node."""
+    unit = runtime / "relay"
+    return unit if is_there(unit) else runtime / f"{node}.relay"
 
 
 def again_path(runtime: Path, node: NodeId) -> Path:

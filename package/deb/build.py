@@ -222,6 +222,7 @@ def furnish(root: Path, home: Path, version: str, when: int) -> None:
             file for kind in ("service", "socket", "timer") for file in share.glob(f"zsched/*.{kind}")
         ],
         "usr/lib/systemd/system/zsched.service.d": [share / "zsched/zsched.service.d/10-user.conf"],
+        "usr/lib/systemd/system/zsched-relay.service.d": [share / "zsched/zsched-relay.service.d/10-user.conf"],
         "usr/lib/systemd/system/zsched-web.service.d": [share / "zsched/zsched-web.service.d/10-user.conf"],
         "usr/share/bash-completion/completions": [commands / "zsched"],
         "usr/share/zsh/vendor-completions": [commands / "_zsched"],

@@ -70,18 +70,19 @@ def relays() -> list[str]:
     return [line.split()[0] for line in processes() if "zsched.relay" in line]
 
 
-def group_of(pid: int) -> Path:
-    """Where to write a process id for the process to join ``pid``'s control group."""
-    lines = [line.split(":", 2) for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines()]
-    named = [f"/sys/fs/cgroup/systemd{path}" for _, name, path in lines if name == "name=systemd"]
-    return Path((named or [f"/sys/fs/cgroup{path}" for number, _, path in lines if number == "0"])[0], "cgroup.procs")
+def groups_of(pid: int) -> list[Path]:
+    """Where to write a process id for the process to join ``pid``'s control group, in each hierarchy that has it."""
+    path = next(line for line in Path(f"/proc/{pid}/cgroup").read_text().splitlines() if line.startswith("0::"))[3:]
+    found = [Path(f"/sys/fs/cgroup{kind}{path}", "cgroup.procs") for kind in ("", "/unified", "/systemd")]
+    return [file for file in found if file.exists()]
 
 
 def crash_and_restart(report: dict[str, object], pid: int) -> int:
     """SIGKILL the daemon, then `systemctl restart`: each time another daemon, and the relay stays; the newest's pid."""
     user = os.stat(f"/proc/{pid}").st_uid  # noqa: PTH116 - a /proc path, nothing to gain
     stray = subprocess.Popen(["sleep", "1001"], start_new_session=True, user=user)
-    group_of(pid).write_text(str(stray.pid))
+    for group in groups_of(pid):
+        group.write_text(str(stray.pid))
     os.kill(pid, 9)
     back = wait_for(lambda state: is_back(state, pid), 20.0)
     stray.poll()

@@ -144,7 +144,7 @@ def begin_fleet(report: Report) -> None:
 
 
 def relay() -> int:
-    return int(json.loads(Path("/run/zsched/robot1.relay.lock").read_text())["pid"])
+    return int(run("systemctl", "show", "zsched-relay.service", "-p", "MainPID", "--value").stdout)
 
 
 def daemon() -> str:

@@ -99,7 +99,10 @@ def furnish(root: Path, fleet: str, node: str, joins: int) -> None:
     endpoints = free_endpoints(5)
     for number, endpoint in enumerate(endpoints):
         fleet = fleet.replace(f"TLS{number}", endpoint.replace("tcp/", "tls/")).replace(f"E{number}", endpoint)
-    units = ("zsched.service", "zsched.service.d/10-user.conf", "zsched-worker@.service", "zsched-worker@.socket")
+    with_user = [
+        f"{name}{kind}" for name in ("zsched", "zsched-relay") for kind in (".service", ".service.d/10-user.conf")
+    ]
+    units = (*with_user, "zsched-worker@.service", "zsched-worker@.socket")
     files = {f"etc/systemd/system/{unit}": (REPO / "systemd" / unit).read_text() for unit in units}
     files |= {
         "etc/systemd/system/zsched.service.d/test.conf": f"[Service]\nEnvironment=ZSCHED_NODE={node}\n",

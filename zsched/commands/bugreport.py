@@ -37,6 +37,7 @@ from zsched.screen import harmless
 
 SCHEMA: Final = "zsched.bugreport/1"
 UNIT: Final = "zsched"
+RELAY_UNIT: Final = "zsched-relay.service"
 JOURNAL_MINUTES: Final = 10
 JOURNAL_LINES: Final = 20_000
 JOURNAL_S: Final = 20.0
@@ -131,7 +132,8 @@ def _json(name: str, body: Json) -> Member:
 
 def _journal() -> str:
     """What the unit has written in the last minutes. Raises `OSError`: it cannot be read."""
-    words = ["journalctl", "--unit", UNIT, "--since", f"-{JOURNAL_MINUTES}min", "--lines", str(JOURNAL_LINES)]
+    units = ("--unit", UNIT, "--unit", RELAY_UNIT)
+    words = ["journalctl", *units, "--since", f"-{JOURNAL_MINUTES}min", "--lines", str(JOURNAL_LINES)]
     try:
         done = subprocess.run(
             [*words, "--no-pager", "--quiet", "--output", "short-iso-precise"],

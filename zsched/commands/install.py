@@ -31,13 +31,14 @@ from zsched.runtime.membership import whose
 
 UNITS: Final = (
     "zsched.service",
+    "zsched-relay.service",
     "zsched-web.service",
     "zsched-renew.service",
     "zsched-renew.timer",
     "zsched-worker@.service",
     "zsched-worker@.socket",
 )
-DROP_INS: Final = ("zsched.service.d/10-user.conf", "zsched-web.service.d/10-user.conf")
+DROP_INS: Final = tuple(f"{unit}.service.d/10-user.conf" for unit in ("zsched", "zsched-relay", "zsched-web"))
 MOST_LINKS: Final = 40
 """As the kernel follows."""
 OPT: Final = "/opt/zsched"

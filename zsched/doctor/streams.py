@@ -20,7 +20,7 @@ YOUNG_S: Final = 60.0
 LISTEN_S: Final = 1.5
 LOOK_S: Final = 1.0
 """In this time a new session knows who subscribes; on one machine it takes some milliseconds."""
-RELAY_FIX: Final = "journalctl -u zsched says what became of the relay"
+RELAY_FIX: Final = "journalctl -u zsched -u zsched-relay says what became of the relay"
 
 
 def inputs_have_publishers(scene: Scene) -> Result:

@@ -40,6 +40,8 @@ class RelayHello(Struct, frozen=True, kw_only=True):
     """Without a local side: those of the host, which zenoh reads once."""
     listen: str = ""
     """Where the data session listens."""
+    credentials: str = ""
+    """The folder of what systemd has handed to the daemon: its sessions' texts name the key there."""
     tasks: tuple[TaskId, ...] | None = None
     """Of its fleet: what the relay carries beside these has ended. ``None``: it ends nothing."""
 

@@ -10,6 +10,7 @@ session. Any other daemon needs another relay: this one says so, and ends.
 from __future__ import annotations
 
 import logging
+import os
 import select
 import socket
 from pathlib import Path
@@ -139,7 +140,8 @@ class Visits:
                 self._refuse(link, f"its greeting is none of ours ({error})")
             _log.warning("a daemon was not let in: no greeting (%s)", error)
             return None
-        found = Daemon(link=link, hello=word, session=_text(texts[0]), local=_text(texts[-1]) if texts[1:] else "")
+        session, local = (_text(frame, word.credentials) for frame in (texts[0], texts[1] if texts[1:] else b""))
+        found = Daemon(link=link, hello=word, session=session, local=local)
         if reason := objection(self._daemon, found, self._threads):
             self._refuse(link, reason)
         self._answer(link, self._here())
@@ -180,5 +182,7 @@ def objection(mine: Daemon | None, its: Daemon, threads: int) -> str:
     return ""
 
 
-def _text(frame: bytes | None) -> str:
-    return (frame or b"").decode(errors="replace")
+def _text(frame: bytes | None, credentials: str) -> str:
+    """Of a session; what systemd has handed to the daemon, it has handed to us in a folder of our own."""
+    text, ours = (frame or b"").decode(errors="replace"), os.environ.get("CREDENTIALS_DIRECTORY", "")
+    return text.replace(credentials, ours) if credentials and ours else text

@@ -5,7 +5,7 @@ from __future__ import annotations
 from support.words import words, words_digest
 from zsched.ipc.relay_socket import PROTOCOL
 
-TODAY = (3, "f30d9ae5c1599229")
+TODAY = (3, "35360c2092ccf9c1")
 """Another digest means: relays of the versions before say other words. Raise `PROTOCOL`, unless one side without the
 word does right all the same: what was added has a default, nobody waits for it, and no member of an enum is new. A
 higher number replaces every relay at an upgrade, and cuts its robot's applications off for a second: say so in the

@@ -107,8 +107,9 @@ class RelayHandle:
         local_config: str = "",
         silence_s: float = SILENCE_S,
         python: str = sys.executable,
+        starts: bool = True,
     ) -> None:
-        """``hello`` says which relay is needed, ``path`` is the socket's.
+        """``hello`` says which relay is needed, ``path`` is the socket's; another one starts relays unless ``starts``.
 
         ``zenoh_config`` is the JSON of the data session, ``local_config`` that of the host's own side; empty: the data
         session serves the host, too. ``silence_s`` should be over zenoh's lease: a call of zenoh that waits for a
@@ -118,7 +119,7 @@ class RelayHandle:
         self._texts = tuple(text.encode() for text in (zenoh_config, local_config) if text)
         self._on_report = on_report
         self._silence_s = min(silence_s, STARVED_S)
-        self._path, self._python = path, python
+        self._path, self._python, self._starts = path, python, starts
         self._lock = threading.Lock()
         self._newest: dict[_Key, _Told] = {}
         self._outbox = _Outbox()
@@ -167,7 +168,7 @@ class RelayHandle:
                 relay.kill()
         if self._thread.is_alive():
             self._thread.join(max(0.5, until - awake_s()))
-        if relay is None or relay.has_ended():
+        if self._starts and (relay is None or relay.has_ended()):
             self._path.unlink(missing_ok=True)
 
     def leave(self) -> None:
@@ -222,6 +223,8 @@ class RelayHandle:
         """
         link = dial(self._path)
         if link is None:
+            if not self._starts:
+                raise AdapterError(f"none listens at {self._path}: see journalctl -u zsched-relay")
             relay = self._relay = start_relay(self._python, self._path)
             relay.meet(self._await_listener(relay))
         else:

@@ -19,6 +19,7 @@ from zsched.exits import EXIT_CONFIG, EXIT_LEFT, EXIT_USAGE
 from zsched.runtime.descriptors import WANTED
 
 UNIT = Path(__file__).parents[4] / "systemd" / "zsched.service"
+RELAY = UNIT.with_name("zsched-relay.service")
 MAX_EXPOSURE = 1.5
 
 
@@ -89,11 +90,10 @@ def test_unit_promises_what_the_daemon_keeps() -> None:
     assert service["RestartPreventExitStatus"] == f"{EXIT_USAGE} {EXIT_CONFIG} {EXIT_LEFT}"
     assert service["SuccessExitStatus"] == str(EXIT_LEFT)
     assert service["WatchdogSec"] == "10"
-    assert service["KillMode"] == "process"
+    assert service["KillMode"] == "mixed"
     assert service["RestartKillSignal"] == RESTART_SIGNAL.name
     assert service["ExecReload"] == f"/bin/kill -{RELOAD_SIGNAL.name.removeprefix('SIG')} $MAINPID"
     assert service["RuntimeDirectoryPreserve"] == "restart"
-    assert service["ExecStopPost"].endswith("-m zsched.runtime.cleanup")
     assert int(service["LimitNOFILE"]) == WANTED
 
 
@@ -117,12 +117,28 @@ def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([tool, *arguments], capture_output=True, text=True, timeout=30, check=False)
 
 
-def test_unit_is_accepted_by_systemd(tmp_path: Path) -> None:
+def test_the_relays_unit_is_what_the_daemons_unit_waits_for() -> None:
+    units = [configparser.RawConfigParser(strict=False) for _ in range(2)]
+    for unit, path in zip(units, (UNIT, RELAY), strict=True):
+        unit.read(path)
+    daemon, relay = units
+    socket_path = dict(word.split("=") for word in daemon["Service"]["Environment"].split())["ZSCHED_RELAY"]
+    assert relay["Service"]["ExecStart"].endswith(f"-m zsched.relay --socket {socket_path}")
+    assert daemon["Unit"]["Wants"] == RELAY.name
+    assert RELAY.name in daemon["Unit"]["After"]
+    assert relay["Service"]["Restart"] == "on-failure"
+    sandbox = [name for name in daemon["Service"] if name.startswith(("protect", "private", "restrict", "systemcall"))]
+    assert {name: relay["Service"][name] for name in sandbox} == {name: daemon["Service"][name] for name in sandbox}
+
+
+@pytest.mark.parametrize("path", [UNIT, RELAY], ids=["daemon", "relay"])
+def test_unit_is_accepted_by_systemd(tmp_path: Path, path: Path) -> None:
     program = tmp_path / "zsched"
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
-    unit = tmp_path / "zsched.service"
-    unit.write_text(UNIT.read_text().replace("/opt/zsched/bin/zsched", str(program)))
+    unit = tmp_path / path.name
+    unit.write_text(path.read_text().replace("/opt/zsched/bin/", f"{tmp_path}/"))
+    (tmp_path / "python").symlink_to(program)
     done = analyze("verify", "--man=no", str(unit))
     assert (done.returncode, done.stderr) == (0, "")
 
