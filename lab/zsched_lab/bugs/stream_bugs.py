@@ -362,8 +362,8 @@ STREAM_BUGS = (
     _bug(
         "a relay has the threads that its daemon has",
         "zsched.relay.__main__",
-        'os.environ["ZENOH_RUNTIME"] = relay_pools(arguments.threads)',
-        "relay_pools(arguments.threads)",
+        'os.environ["ZENOH_RUNTIME"] = relay_pools(hello.threads + hello.spare_threads)',
+        "relay_pools(hello.threads + hello.spare_threads)",
         ("tests/integration/test_zenoh_pools.py",),
     ),
     _bug(

