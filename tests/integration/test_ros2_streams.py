@@ -21,6 +21,7 @@ from support.ros_host import RosHost, opened
 from support.waiting import until
 from zsched.core.route.ros2 import Attachment, decode_attachment, encode_attachment
 from zsched.sessions.config import client_config, worker_config
+from zsched.sessions.matching import is_matched
 
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
@@ -277,6 +278,7 @@ def test_a_request_whose_relay_is_killed_ends_without_a_reply_and_the_next_one_i
     until(lambda: [reply.ok is not None for reply in ask()] == [True], "the next request is answered")
 
 
+ALL_COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 ACTION_FILE = FILE.replace(
     """      inputs: [{topic: /map, worker_topic: "/{target}/merge/{robot}/map", class: latest}]
       outputs: [{topic: /merged_map, worker_topic: "/{target}/merge/map", class: latest}]
@@ -319,9 +321,12 @@ def test_a_goals_result_is_asked_of_the_next_owner_when_the_first_one_goes() -> 
 
         def ask(part: str) -> Any:
             mark = encode_attachment(Attachment(sequence=1, stamp_ns=time.time_ns(), gid=bytes(16)))
-            key, all_complete = f"0/spin/_action/{part}/{PARTS[part]}", zenoh.QueryTarget.ALL_COMPLETE
-            return robot.get(key, target=all_complete, payload=b"goal", attachment=mark, timeout=20.0)
+            key = f"0/spin/_action/{part}/{PARTS[part]}"
+            return robot.get(key, target=ALL_COMPLETE, payload=b"goal", attachment=mark, timeout=20.0)
 
+        for part in ("send_goal", "get_result"):
+            querier = robot.declare_querier(f"0/spin/_action/{part}/{PARTS[part]}", target=ALL_COMPLETE)
+            until(lambda querier=querier: is_matched(querier), f"the robot's session knows {part}")  # type: ignore[misc]
         (sent,) = list(ask("send_goal"))
         assert sent.ok is not None
         assert sent.ok.payload.to_bytes() == b"edge1"

@@ -68,7 +68,7 @@ class RelayProcess:
         if not self.has_ended():
             with contextlib.suppress(OSError):
                 os.kill(self.pid, signal.SIGKILL)
-        self.wait(ENDING_S)
+        self.wait(10 * ENDING_S)  # a busy machine takes its time, and until then its socket listens
 
     def hang_up(self) -> None:
         """End the link, for the relay as for us: its commands are over."""
