@@ -47,12 +47,13 @@ class RelayProcess:
 
     def has_ended(self) -> bool:
         """Whether the process is gone; a child is reaped by this, also one of this process before it began anew."""
+        found = parse_process_stat(read_file(f"/proc/{self.pid}/stat"))
         with contextlib.suppress(ChildProcessError):
             pid, status = os.waitpid(self.pid, os.WNOHANG) if self.pid > 0 else (0, 0)
             if pid:
                 self.ending = f"exit code {os.waitstatus_to_exitcode(status)}"
-        found = parse_process_stat(read_file(f"/proc/{self.pid}/stat"))
-        return found is None or found.state in ("Z", "X")
+        # The first thread may be dead before the others, whose files are open.
+        return found is None or (found.state in ("Z", "X") and found.threads <= 1)
 
     def wait(self, timeout_s: float) -> bool:
         """Whether the process is gone within ``timeout_s``."""

@@ -10,6 +10,7 @@ dies, is wedged, or is not the one that is needed is followed by another one.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import select
 import socket
@@ -250,8 +251,9 @@ class RelayHandle:
         """Say who we are; answers why the relay does not obey us, or ``""``. One that does not has ended then."""
         patience_s = 0.0
         try:
-            for frame in (wire.encode(self._hello), *self._texts):
-                write_frame(relay.descriptor, frame)
+            with contextlib.suppress(BrokenPipeError):  # it may have refused us by the first word, and says why
+                for frame in (wire.encode(self._hello), *self._texts):
+                    write_frame(relay.descriptor, frame)
             self._await_answer(relay)
             answer: RelayHere | RelayRefused | None = None
             if (word := read_frame(relay.descriptor)) is not None:
@@ -278,12 +280,11 @@ class RelayHandle:
         silence = Silence(relay.pid, GREETING_S)
         poller = select.poll()
         poller.register(relay.descriptor, select.POLLIN)
-        while True:
-            asked_s, began = silence.left_s, awake_s()
-            if poller.poll(asked_s * 1000):
-                return
+        began = awake_s()
+        while not poller.poll((asked_s := silence.left_s) * 1000):
             if reason := silence.go_on(asked_s, awake_s() - began):
                 raise TimeoutError(reason)
+            began = awake_s()
 
     def _serve(self, relay: RelayProcess) -> str:
         with self._lock:
