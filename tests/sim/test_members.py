@@ -46,7 +46,7 @@ def test_a_machine_that_is_invited_joins_and_may_be_an_elector(generation: int) 
     play.settle()
     node = play.sim.node("robot5")
     assert (node.agreement.problems, node.agreement.generation) == ({}, generation)
-    assert "robot5" in node.rounds.voters
+    assert "robot5" in node.in_force.voters
     assert play.sim.agreed(TASK) is not None
 
 

@@ -183,11 +183,11 @@ def test_robots_that_are_away_for_long_do_not_count_and_the_rest_decides() -> No
     assert play.sim.run_until(planned_moves_stop, 5), "three of five robots are silent, and count still"
     assert play.sim.run_until(lambda: all(value.away == robots[:3] for value in play.values()), 3 * AWAY_S)
     assert not planned_moves_stop(), seen[-1]
-    assert play.sim.node("robot5").rounds.voters == robots[3:]
+    assert play.sim.node("robot5").in_force.voters == robots[3:]
     play.owner_is_alive()
     play.sim.start("robot2")
     assert play.sim.run_until(lambda: all(value.away == ("robot1", "robot3") for value in play.values()), AWAY_S)
-    assert play.sim.node("robot2").rounds.voters == ("robot2", *robots[3:]), "it has learnt so itself"
+    assert play.sim.node("robot2").in_force.voters == ("robot2", *robots[3:]), "it has learnt so itself"
 
 
 def test_a_robot_that_comes_back_into_its_document_counts_from_its_start() -> None:
@@ -198,7 +198,7 @@ def test_a_robot_that_comes_back_into_its_document_counts_from_its_start() -> No
     play.sim.crash("robot2")
     play.sim.start("robot2")
     assert play.sim.run_until(lambda: "robot2" in play.sim.running(), 5)
-    assert play.sim.node("robot2").rounds.voters == ("robot2", "robot3"), "its disk says who is away"
+    assert play.sim.node("robot2").in_force.voters == ("robot2", "robot3"), "its disk says who is away"
 
 
 def test_a_node_that_leaves_hands_over_gives_its_seat_up_and_gets_neither_back() -> None:

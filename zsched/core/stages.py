@@ -329,7 +329,7 @@ class Stages:
     def _is_enough(self, spec: TaskSpec) -> bool:
         """Whether this robot can do the task itself, and no other one shares it."""
         is_ready = self.worker_states.get(spec.name) is WorkerState.READY
-        return is_ready and self.me in spec.candidates and tuple(self.rounds.voters) == (self.me,)
+        return is_ready and self.me in spec.candidates and self.in_force.voters == (self.me,)
 
     def _heard(self, spec: TaskSpec, now: float) -> Iterator[tuple[NodeId, Profile]]:
         """The other living candidates with a fresh profile."""

@@ -46,8 +46,8 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
     _bug(
         "robots vote as by the file before",
         IN_FORCE,
-        "        self.voters = fleet.voters\n",
-        "        self.voters = getattr(self, 'voters', fleet.voters)\n",
+        "        self.voters = self.robots = fleet.voters\n",
+        "        self.voters = self.robots = getattr(self, 'voters', fleet.voters)\n",
         _FLEET,
     ),
     _bug(
@@ -87,9 +87,9 @@ ADOPTION_BUGS: tuple[Bug, ...] = (
     ),
     _bug(
         "the register of the fleet keeps the clocks of before",
-        "zsched.core.electorate.numbers",
-        "        return self._here.timing\n",
-        "        return self.__dict__.setdefault('_first', self._here.timing)\n",
+        IN_FORCE,
+        "        return self.timing\n",
+        "        return self.__dict__.setdefault('_first', self.timing)\n",
         _CHANGES,
     ),
     _bug(

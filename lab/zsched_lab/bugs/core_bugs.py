@@ -1314,7 +1314,7 @@ VOTE_BUGS = (
     _bug(
         "each robot that can do the task itself must see the others' workers",
         "zsched.core.stages",
-        " and tuple(self.rounds.voters) == (self.me,)",
+        " and self.in_force.voters == (self.me,)",
         "",
         ("tests/sim/test_unseen_streams.py",),
     ),

@@ -24,7 +24,7 @@ from zsched.core.values.change import Rewrite
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import Creation, FleetValue
-from zsched.core.values.fleet import Fleet, Timing
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
@@ -76,9 +76,6 @@ class Numbers:
     def _fleet(self) -> Fleet:
         return self._here.fleet
 
-    def _clocks(self) -> Timing:
-        return self._here.timing
-
     def begin(self, generation: int, electorate: str, todo: ToDo, now: float, *, may_elect: bool) -> None:
         """The generation is known: count by what the state holds, or by what every node makes of its file."""
         first = founded(self._fleet.name, generation, self._fleet.electors)
@@ -93,7 +90,7 @@ class Numbers:
             begin=self._created,
             holds=self._may_follow,
             electorate=electorate,
-            clocks=self._clocks,
+            clocks=self._here.clocks,
             rng=self._rng,
             now=now,
             may_elect=may_elect,
@@ -124,7 +121,7 @@ class Numbers:
             is_elector=False,
             initial=task.first_value(creation.start),
             state=self._recall(creation) or RegisterState(task=creation.task, creation=creation.number),
-            clocks=self._clocks,
+            clocks=self._here.clocks,
             rng=self._rng,
             disk=self.disk,
         )

@@ -101,10 +101,6 @@ class HangWatch:
         self._back_at: dict[NodeId, float] = in_force.by_node()
         """{robot: when it was heard again after a silence}."""
 
-    @property
-    def _voters(self) -> tuple[NodeId, ...]:
-        return self._in_force.fleet.voters
-
     def _has_deadline(self, task: TaskId) -> bool:
         return self._in_force.tasks[task].worker.output_deadline_s is not None
 
@@ -135,7 +131,7 @@ class HangWatch:
 
     def on_back(self, node: NodeId, now: float) -> None:
         """A peer that was suspect or gone is heard again."""
-        if node in self._voters:
+        if node in self._in_force.robots:
             self._back_at[node] = now
 
     def _unproven(self, spec: TaskSpec, now: float) -> frozenset[NodeId]:
@@ -156,7 +152,9 @@ class HangWatch:
     ) -> None:
         """A robot's profile came: restart our workers that hang; of a foreign worker only report it."""
         for spec in [self._in_force.tasks[task] for task in owned if self._has_deadline(task)]:
-            profiles = [profile for robot in self._voters if (profile := gateway.fresh(robot, now)) is not None]
+            profiles = [
+                profile for robot in self._in_force.robots if (profile := gateway.fresh(robot, now)) is not None
+            ]
             reason = self._judge.hangs(spec, executors[spec.name], profiles, now, self._unproven(spec, now))
             if not reason:
                 continue

@@ -48,7 +48,7 @@ def go_by(node: Stages, fleet: Fleet, todo: ToDo, now: float) -> None:
     node.in_force.take(fleet, anew)
     node.clear_problems(Problem.FLEET, Problem.OWN_FILE)
     node.profiler.retune(fleet.timing)
-    node.gateway.version += 1
+    node.gateway.shares.keep(node.in_force.nodes)
     node.rounds.on_fleet(now, anew)
     node.agreement.on_fleet(todo, now)
     node.unconfirmed = {name: why for name, why in node.unconfirmed.items() if name in node.registers}

@@ -172,12 +172,7 @@ class Rounds:
     @property
     def is_voter(self) -> bool:
         """Whether this node is a robot."""
-        return self._me in self._in_force.fleet.voters
-
-    @property
-    def voters(self) -> tuple[NodeId, ...]:
-        """The robots that count: a majority of them must have been heard."""
-        return self._in_force.voters
+        return self._me in self._in_force.robots
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -254,7 +249,7 @@ class Rounds:
         self._round_at = now + timing.decide_s * (0.9 + 0.2 * self._rng.random())
         self._number += 1
         own = self.vectors(values, states, now)
-        expected = [name for name in self.voters if name != self._me and states[name] is PeerState.ALIVE]
+        expected = [name for name in self._in_force.voters if name != self._me and states[name] is PeerState.ALIVE]
         answered = self._kept if self._rests(own.vectors, states, now) else None
         self._gather = _Gather(
             number=self._number,
@@ -307,9 +302,9 @@ class Rounds:
                 voter: vector
                 for voter, all_vectors in sorted(gathered.vectors.items())
                 for vector in all_vectors
-                if vector.task == name and voter in self.voters
+                if vector.task == name and voter in self._in_force.voters
             }
-            task.silent = tuple(voter for voter in self.voters if voter not in vectors)
+            task.silent = tuple(voter for voter in self._in_force.voters if voter not in vectors)
             proposal = self._judge(task, tuple(vectors.values()), values, states, todo, now)
             if proposal is not None:
                 yield proposal
@@ -395,8 +390,8 @@ class Rounds:
             now=now,
             rules=task.rules,
             allocation=allocation,
-            voters=self.voters,
-            present=tuple([voter for voter in self.voters if states[voter] is not gone]),
+            voters=self._in_force.voters,
+            present=tuple([voter for voter in self._in_force.voters if states[voter] is not gone]),
             vectors=vectors,
             electors=self._in_force.electors,
             electors_heard=tuple([one for one in self._in_force.electors if states.get(one, gone) in HEARD]),

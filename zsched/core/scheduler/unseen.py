@@ -80,7 +80,8 @@ class Unseen(Struct):
         self._looked_at = now
         is_seen = {name: tokens.sees(name, spec.name) for name in ready} if shows_token(spec) else {}
         missed = [name for name, seen in is_seen.items() if not seen] if is_enough or any(is_seen.values()) else []
-        absences = self._absences.setdefault(spec.name, {})
+        absences = {name: one for name, one in self._absences.get(spec.name, {}).items() if name in self.in_force.nodes}
+        self._absences[spec.name] = absences
         for name in missed:
             absences.setdefault(name, Absences())
         away_s = {name: one.look(name in missed, now, UNSEEN_S) for name, one in absences.items()}

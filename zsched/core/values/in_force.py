@@ -40,11 +40,15 @@ class InForce:
         """Its hash."""
         self.nodes: dict[NodeId, NodeSpec] = {node.name: node for node in fleet.nodes}
         self.tasks: dict[TaskId, TaskSpec] = {task.name: task for task in fleet.tasks}
-        self.voters = fleet.voters
-        """The robots that count in votes: all of them, until `count` leaves out those that are away."""
+        self.voters = self.robots = fleet.voters
+        """The robots that count in votes: all of them (`robots`), until `count` leaves out those that are away."""
         self.electors = fleet.electors
         self.timing: Timing = fleet.timing.paced(self._save_s)
         """The fleet's clocks; those of votes and ballots leave room for saves (`pace`)."""
+
+    def clocks(self) -> Timing:
+        """`timing`, for parts that need to know nothing else."""
+        return self.timing
 
     # --- what parts remember -----------------------------------------------------------------------------------------
 

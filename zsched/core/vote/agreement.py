@@ -27,7 +27,7 @@ from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import TOLD_DIGITS, Creation, Elector, FleetValue, terms_of
-from zsched.core.values.fleet import Fleet, TaskSpec, Timing
+from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accepted, FleetQuestion, Learnt, Promise, Refused, votes_of
@@ -136,7 +136,7 @@ class Agreement:
         )
         self.orders = Orders(self._numbers)
         self.strangers = Strangers(in_force=in_force)
-        self.helm = Helm(self._numbers, me, clocks=self._clocks, now=now)
+        self.helm = Helm(self._numbers, me, clocks=self._in_force.clocks, now=now)
         self.at_start = ToDo()
         """What the first batch must do: fetch a document that is missing."""
         if self.generation is not None:
@@ -184,7 +184,7 @@ class Agreement:
             initial=task.first_value(state.creation * CREATION_STEP),
             state=state,
             disk="" if self._durable is None else self._durable.disk,
-            clocks=self._clocks,
+            clocks=self._in_force.clocks,
             rng=self._rng,
         )
 
@@ -230,9 +230,6 @@ class Agreement:
     @property
     def _fleet(self) -> Fleet:
         return self._in_force.fleet
-
-    def _clocks(self) -> Timing:
-        return self._in_force.timing
 
     @property
     def _by_file(self) -> str:

@@ -301,6 +301,20 @@ def test_what_a_task_needed_is_not_what_one_of_its_name_needs_that_comes_later(*
     assert node.gateway.demand(other, small).memory_mb == 20_000.0, "it has stayed"
 
 
+def test_what_a_machine_gave_is_not_held_against_one_of_its_name_that_comes_later() -> None:
+    merge = task_of("merge", candidates=("edge1", "edge2"))
+    there = fleet_of(merge, of=("edge1", "edge2", *ROBOTS))
+    gone = fleet_of(replace(merge, candidates=("edge2",)), of=("edge2", *ROBOTS))
+    node = node_of(there)
+    crowded = load_of(memory_mb=100.0, cpu_cores=1.0, wanted_cores=3.0)
+    full = profile_of("edge1", cpu_used_cores=4.0, runnable=4.0, workers=(crowded,))
+    assert node.gateway.shares.learn("merge", full, START)
+    before = node.gateway.shares.at("merge", full, 3.0)
+    for fleet in (gone, there):
+        adopt(node, fleet)
+    assert node.gateway.shares.at("merge", full, 3.0) > before
+
+
 def test_what_was_remembered_of_a_task_is_not_remembered_of_one_of_its_name_that_comes_unheard() -> None:
     """Its first placement waited for nobody, and its machine paid for what the former task had suffered there."""
     merge, other = (task_of(name, candidates=("edge1",)) for name in ("merge", "other"))

@@ -329,7 +329,7 @@ def test_what_too_few_electors_could_agree_to_is_not_called_for() -> None:
 def test_an_elector_that_has_left_the_document_is_silent() -> None:
     """It keeps its seat until the electors have agreed to remove it, and is no peer any more."""
     robot = Robot()
-    robot.rounds._in_force.count(robot.rounds.voters, ("gone1", "robot1", "robot2"))
+    robot.rounds._in_force.count(robot.rounds._in_force.voters, ("gone1", "robot1", "robot2"))
     robot.states.update(edge1=PeerState.GONE, robot2=PeerState.GONE, robot3=PeerState.GONE)
     assert proposed(robot.tick()) == []
     assert robot.task.judgement is not None

@@ -136,6 +136,16 @@ def test_an_owner_that_comes_and_goes_is_left_while_it_is_away_and_not_when_it_c
     assert come_and_go(robot, 3) == [set(), set(), set(), set(), {"edge1"}, set()]
 
 
+def test_a_node_of_the_same_name_that_comes_later_has_not_come_and_gone() -> None:
+    robot = Robot("edge2", "edge1")
+    come_and_go(robot, 4)
+    before = robot.here.fleet
+    robot.here.take(replace(before, nodes=tuple(node for node in before.nodes if node.name != "edge1")))
+    robot.look("edge2")
+    robot.here.take(before)
+    assert robot.look() == set()
+
+
 def test_a_token_that_is_away_for_a_moment_now_and_then_is_no_reason() -> None:
     robot = Robot("edge2", "edge1")
     assert come_and_go(robot, 20, away_s=4.0, there_s=41.0) == [set()] * 40
