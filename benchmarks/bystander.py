@@ -14,8 +14,8 @@ from types import TracebackType
 from typing import Self
 
 from zsched.core.values.fleet import Timing
-from zsched.guard import guarded
-from zsched.sessions.config import client_config
+from zsched.host.guard import guarded
+from zsched.link.sessions.config import client_config
 
 PATIENT = Timing(zenoh_lease_s=20.0)
 """The end of its lease helps nobody."""

@@ -27,9 +27,9 @@ from collections import Counter
 from pathlib import Path
 
 from benchmarks.common import machine
-from zsched.clock import monotonic_s
 from zsched.core.hop.books import given_up, unaccounted
 from zsched.core.values.plan import StreamCount
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet.netbed import Netbed, Probe
 from zsched_lab.fleet.testbed import TASK, Json, echo_fleet
 

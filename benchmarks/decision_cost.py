@@ -20,12 +20,12 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.judge import Judge
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import compare
+from zsched.core.values import codec as wire
 from zsched.core.values.fleet import Demand, Fleet, NodeSpec, TaskSpec, Timing
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, NodeKind, PeerState, ScoreForm, Tuning, UtilityVector, Weights
 from zsched.core.values.profile import Jobs, Link, LinkSource, Profile, WorkerLoad, WorkerState
-from zsched.wire import codec as wire
 
 CANDIDATES, ROBOTS = (3, 10, 50, 200), (3, 10, 50)
 GOAL_MS = 2.0

@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.common import machine
-from zsched.adapters.host.decision_log import read_page
 from zsched.core.values.model import NodeId
+from zsched.host.decision_log import read_page
 from zsched_lab.fleet.limits import NodeLimits, make_limits
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 

@@ -19,7 +19,7 @@ import psutil
 
 from benchmarks.common import machine
 from benchmarks.silent import certificates, with_tls
-from zsched.sessions.config import control_config
+from zsched.link.sessions.config import control_config
 from zsched_lab.fleet.loopback import free_endpoint
 
 OWN = "robot1.yard.zsched.internal"
@@ -35,7 +35,7 @@ for _ in sys.stdin:
 """
 SHOWER = """
 import sys, time, zenoh
-from zsched.sessions.link_sockets import LinkSockets
+from zsched.link.sessions.link_sockets import LinkSockets
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
 time.sleep(0.5)
 (link,) = LinkSockets(session).links()

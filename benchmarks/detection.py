@@ -29,8 +29,8 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, save, summary, table, together
-from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import Netbed, Probe, descendants_running, stamped, stop_group
 from zsched_lab.fleet.testbed import TASK, TestbedError, echo_fleet

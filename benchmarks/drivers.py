@@ -23,7 +23,7 @@ import psutil
 
 from benchmarks.common import machine
 from benchmarks.record import progress
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet.containers import NoEngineError, container_host
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.common import machine
-from zsched.clock import monotonic_s
 from zsched.core.hop.books import given_up
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.model import NodeId
-from zsched.errors import AdapterError
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet.chaos import ChaosBed, chaos_fleet
 from zsched_lab.fleet.netbed import Netbed, Probe, descendants_running, stop_group
 from zsched_lab.fleet.slow_disk import SlowDisk

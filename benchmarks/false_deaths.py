@@ -26,8 +26,8 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, save, together
-from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import Netbed
 from zsched_lab.fleet.testbed import echo_fleet

@@ -26,7 +26,7 @@ import psutil
 
 from benchmarks.common import cpu_s, machine
 from zsched.core.values.problems import of_kind
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 

@@ -24,13 +24,13 @@ from pathlib import Path
 import psutil
 
 from benchmarks.common import cpu_s, machine
-from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.values import codec as wire
 from zsched.core.values.beat import Beat
 from zsched.core.values.messages import Prepare
 from zsched.core.values.model import Ballot, Proposal
-from zsched.runtime.access_rules import Side
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.core.values.relay_protocol import StreamAck, StreamAcks
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.access_rules import Side
 from zsched_lab.fleet.floods import connections
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.openings import Stream

@@ -32,10 +32,10 @@ from pathlib import Path
 
 from benchmarks.common import machine
 from benchmarks.rig import Load, Rig, Traffic, routes, told_of
-from zsched.core.events import SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.hop.books import unaccounted
-from zsched.core.relay_protocol import RelayStarted
+from zsched.core.values.events import SlotFlipped, SlotReady, StreamsCounted
 from zsched.core.values.plan import RoutePhase, Slot, StreamClass, StreamCount, WorkerRole
+from zsched.core.values.relay_protocol import RelayStarted
 from zsched_lab.fleet.relays import ROBOT, TASK
 from zsched_lab.fleet.waiting import until
 

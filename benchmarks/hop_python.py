@@ -21,12 +21,12 @@ from typing import Any
 import zenoh
 
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.outputs import OutputStream
 from zsched.relay.streams.receive import undeclare
-from zsched.sessions.config import data_config, worker_config
-from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.waiting import until
 

@@ -21,8 +21,8 @@ import psutil
 import zenoh
 
 from benchmarks.common import machine, percentile
-from zsched import paths as places
-from zsched.adapters.host.operator_client import ask
+from zsched.host import paths as places
+from zsched.host.operator_client import ask
 from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.testbed import ECHO, Testbed, echo_fleet
 

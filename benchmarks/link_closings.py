@@ -22,8 +22,8 @@ from pathlib import Path
 from benchmarks.common import machine
 from benchmarks.false_deaths import SETTLE_S, busy_cores
 from benchmarks.idle import TreeBed
-from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId, PeerState
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import CONTROL_PORT, DATA_PORT
 from zsched_lab.fleet.testbed import echo_fleet

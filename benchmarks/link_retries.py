@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.link_retries [--links 60] [--seconds 120] [--loss 20]``. Needs root: two network namespaces in
 which this many of 100 packets are lost on their way in. Half of the connections have the waits of the control session's
-links (`zsched.sessions.link_retries`). Over each one both ends send 150 bytes every 0.2 s, as beats do. Prints how many
-silences of an hour and link were longer.
+links (`zsched.link.sessions.link_retries`). Over each one both ends send 150 bytes every 0.2 s, as beats do. Prints
+how many silences of an hour and link were longer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import time
 from collections.abc import Iterable
 
 from benchmarks.common import machine, percentile
-from zsched.sessions.link_sockets import retry_steadily
+from zsched.link.sessions.link_sockets import retry_steadily
 from zsched_lab.fleet.netns import Network
 
 PORT, PERIOD_S, BYTES, OPEN_S = 7457, 0.2, 150, 60.0

@@ -19,7 +19,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.common import cpu_s, machine
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 WORKER = """

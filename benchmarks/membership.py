@@ -31,15 +31,15 @@ from typing import Any
 
 from benchmarks.common import machine, percentile
 from benchmarks.record import progress
-from zsched.clock import monotonic_s
 from zsched.config.load import load_fleet
 from zsched.core.electorate.founding import created
 from zsched.core.values.beat import Beat
+from zsched.core.values.codec import document_hash, encode, encode_state
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import Elector
 from zsched.core.values.model import RegisterState
 from zsched.core.vote.generations import blank_state
-from zsched.wire.codec import document_hash, encode, encode_state
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet.hall import Hall
 from zsched_lab.fleet.netns import INTERFACE, Network, run
 

@@ -25,7 +25,7 @@ import zenoh
 
 from benchmarks.common import machine, percentile
 from benchmarks.silent import certificates, with_tls
-from zsched.sessions.config import control_config, data_config
+from zsched.link.sessions.config import control_config, data_config
 from zsched_lab.fleet import netns
 
 SETUPS = (("two tls", "tls", 2), ("two quic", "quic", 2), ("one tls", "tls", 1), ("one quic", "quic", 1))

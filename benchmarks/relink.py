@@ -28,7 +28,7 @@ import zenoh
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, table
 from zsched.core.values.fleet import Timing
-from zsched.sessions import config as zenoh_config
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.netns import Network, why_not
 
 LEASE_S = 1.0

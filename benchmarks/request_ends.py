@@ -21,8 +21,8 @@ import zenoh
 from benchmarks.common import machine
 from benchmarks.record import Record, progress, table
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.relay.services.service import ServiceStream
-from zsched.sessions.config import data_config, worker_config
 from zsched_lab.fleet.loopback import free_endpoints
 from zsched_lab.fleet.pace import at_pace
 from zsched_lab.fleet.waiting import until

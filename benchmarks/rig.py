@@ -16,9 +16,8 @@ from typing import Any
 import psutil
 import zenoh
 
-from zsched.core.events import SlotDrained, StreamsCounted
 from zsched.core.hop.books import given_up, unaccounted
-from zsched.core.relay_protocol import SlotLost
+from zsched.core.values.events import SlotDrained, StreamsCounted
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -31,6 +30,7 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
+from zsched.core.values.relay_protocol import SlotLost
 from zsched_lab.fleet.relays import ROBOT, TASK, Relays
 from zsched_lab.fleet.waiting import until
 

@@ -22,8 +22,8 @@ from typing import Any
 
 from benchmarks.common import line, machine
 from benchmarks.false_deaths import pass_time
-from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId, PeerState
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import OnboardBed, Probe
 from zsched_lab.fleet.testbed import TASK, echo_fleet

@@ -31,19 +31,19 @@ from typing import IO, Any
 
 from benchmarks.common import machine, mean
 from benchmarks.record import Record, Row, progress, save, table
-from zsched.adapters.host.state_file import StateFile
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.clock import monotonic_s
+from zsched.commands.members.blank import init_state
 from zsched.config.load import load_fleet
-from zsched.core import events as ev
-from zsched.core import instructions as do
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.profile import DeviceSample, WorkerState
-from zsched.runtime.endpoints import endpoints_for, free_port
-from zsched.runtime.init import init_state
-from zsched.sessions import config as zenoh_config
+from zsched.host.clock import monotonic_s
+from zsched.host.state_file import StateFile
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.sessions import config as zenoh_config
+from zsched.link.sessions.endpoints import endpoints_for, free_port
 from zsched_lab.fleet.testbed import TASK, echo_fleet
 
 GOAL = "p99 50 ms at 6"

@@ -29,11 +29,11 @@ import zenoh
 
 from benchmarks.common import cpu_s, machine, percentile
 from benchmarks.floods import certified, with_local_side
-from zsched import paths as places
-from zsched.adapters.host.operator_client import ask
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.host import paths as places
+from zsched.host.operator_client import ask
+from zsched.link.sessions.config import client_config
 from zsched.pki.authority import opened
-from zsched.sessions.config import client_config
 from zsched_lab.fleet.testbed import Testbed, TestbedError, echo_fleet
 
 ROBOT, KIB, MIB = "robot1", 1 << 10, 1 << 20

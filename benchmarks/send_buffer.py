@@ -21,10 +21,10 @@ import zenoh
 
 from benchmarks.common import machine, percentile
 from benchmarks.silent import certificates, with_tls
-from zsched.sessions.config import DATA_SEND_BUFFER, data_config
-from zsched.sessions.link_buffers import LinkBuffers
-from zsched.sessions.link_sockets import LinkSockets
-from zsched.sessions.stalled_links import StalledLinks
+from zsched.link.sessions.config import DATA_SEND_BUFFER, data_config
+from zsched.link.sessions.link_buffers import LinkBuffers
+from zsched.link.sessions.link_sockets import LinkSockets
+from zsched.link.sessions.stalled_links import StalledLinks
 from zsched_lab.fleet.loopback import free_endpoint
 
 MIB, SLOW_MS = 1 << 20, 150.0
@@ -32,9 +32,9 @@ SIZED = -1
 LOOKED_AT, LOOKS = 6, 1000
 ECHO = """
 import contextlib, sys, zenoh
-from zsched.sessions.link_buffers import LinkBuffers
-from zsched.sessions.link_sockets import LinkSockets
-from zsched.sessions.stalled_links import StalledLinks
+from zsched.link.sessions.link_buffers import LinkBuffers
+from zsched.link.sessions.link_sockets import LinkSockets
+from zsched.link.sessions.stalled_links import StalledLinks
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
 watch = StalledLinks(session, 1000.0) if sys.argv[2] == "sized" else contextlib.nullcontext()
 back = session.declare_publisher("back", congestion_control=zenoh.CongestionControl.BLOCK)

@@ -23,15 +23,15 @@ import zenoh
 
 from benchmarks.common import machine
 from zsched.core.values.certificates import Role
+from zsched.host.key_files import PRIVATE, PUBLIC, write_whole
+from zsched.link.sessions.config import client_config, control_config
 from zsched.pki.authority import create
-from zsched.pki.files import PRIVATE, PUBLIC, write_whole
-from zsched.sessions.config import client_config, control_config
 from zsched_lab.fleet.floods import connections
 from zsched_lab.fleet.loopback import free_endpoint
 
 LISTENER = """
 import sys, zenoh
-from zsched.sessions.link_sockets import hold_back_silent
+from zsched.link.sessions.link_sockets import hold_back_silent
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
 if sys.argv[2] == "held":
     hold_back_silent()

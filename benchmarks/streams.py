@@ -25,9 +25,7 @@ from tempfile import TemporaryDirectory
 import zenoh
 
 from benchmarks.common import ask, cpu_s, machine, median_us, read
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.values.fleet import WorkerLink
 from zsched.core.values.plan import (
     Direction,
@@ -39,7 +37,9 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.sessions.config import data_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.link.sessions.config import data_config, worker_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.relays import FLEET, hello_of
 from zsched_lab.fleet.waiting import until

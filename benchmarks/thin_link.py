@@ -20,9 +20,9 @@ import time
 from pathlib import Path
 
 from benchmarks.common import line, machine
-from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
-from zsched.sessions import config as zenoh_config
+from zsched.host.clock import monotonic_s
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import PROBE, Netbed, Probe, descendants_running
 from zsched_lab.fleet.testbed import Json, echo_fleet

@@ -38,7 +38,7 @@ import zenoh
 
 from benchmarks.common import machine
 from zsched.cli import app
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 from zsched_lab.fleet.pace import at_pace
 

@@ -138,7 +138,7 @@ def say_report(report: dict[str, Any], *, same: bool, took_s: float) -> None:
 
 def relay_goes_on(old: Path, new: Path, folder: Path) -> bool:
     """Whether the new version's daemon goes on with the old version's relay."""
-    ask = "from zsched.ipc.takeover import PROTOCOL; print(PROTOCOL)"
+    ask = "from zsched.link.pipe.takeover import PROTOCOL; print(PROTOCOL)"
     before, after = (asked(unpacked(package, folder), ask) for package in (old, new))
     return before == after
 

@@ -15,7 +15,7 @@ def main() -> None:
 
         run()
     except KeyboardInterrupt:
-        from zsched.exits import EXIT_INTERRUPTED  # noqa: PLC0415 - nothing is imported outside of the `try`
+        from zsched.core.values.exits import EXIT_INTERRUPTED  # noqa: PLC0415 - nothing is imported outside of the `try`
 
         sys.exit(EXIT_INTERRUPTED)
 

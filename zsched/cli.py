@@ -18,9 +18,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from zsched.commands.common import warn
+from zsched.commands.base.common import warn
 from zsched.commands.program import Program
-from zsched.exits import EXIT_FAILED
+from zsched.core.values.exits import EXIT_FAILED
 
 EPILOG = (
     "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "

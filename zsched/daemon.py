@@ -23,62 +23,62 @@ import time
 from pathlib import Path
 
 from zsched import __version__
-from zsched import paths as places
-from zsched.adapters.host import zenoh_log
-from zsched.adapters.host.decision_log import DecisionLog
-from zsched.adapters.host.operator_socket import OperatorSocket
-from zsched.adapters.host.rehearsals import RehearsalStore
-from zsched.adapters.host.state_file import StateFile
-from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.limits import in_turn_hz, limit_for
-from zsched.adapters.relay.streams import SILENCE_S, RelayHandle
-from zsched.adapters.workers.hired import FOLDER, relay_socket
-from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
-from zsched.clock import SleepWatch, monotonic_s
 from zsched.config.load import load_fleet, require_node
-from zsched.core import events as ev
-from zsched.core.node import Node, in_parts
-from zsched.core.status import status_line
+from zsched.core.node.node import Node, in_parts
+from zsched.core.node.status import status_line
+from zsched.core.values import events as ev
 from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.errors import AdapterError, ConfigError, NameTakenError
+from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
 from zsched.core.values.fleet import Fleet, WorkerLink, electorate_hash, fleet_hash
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.problems import Problem
 from zsched.core.values.snapshot import Exposure
 from zsched.core.values.struct import Struct
-from zsched.errors import AdapterError, ConfigError, NameTakenError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_LEFT, EXIT_NAME_TAKEN, EXIT_OK
-from zsched.guard import calmed, end_with, on_failure
-from zsched.heap import Leftovers, give_back, share_heaps
-from zsched.ipc.protocol import RelayHello
-from zsched.ipc.relay_socket import PROTOCOL, ask_relay
-from zsched.log_limit import log_to_stderr
-from zsched.runtime import tls as daemon_tls
+from zsched.host.document_store import copied_file
+from zsched.host import paths as places
+from zsched.host import zenoh_log
+from zsched.host.clock import SleepWatch, monotonic_s
+from zsched.host.decision_log import DecisionLog
+from zsched.host.guard import calmed, end_with, on_failure
+from zsched.host.heap import Leftovers, give_back, share_heaps
+from zsched.host.log_limit import log_to_stderr
+from zsched.host.operator_socket import OperatorSocket
+from zsched.host.rehearsals import RehearsalStore
+from zsched.host.screen import fitted
+from zsched.host.state_file import StateFile
+from zsched.host.systemd import Notifier, watchdog_interval_s
+from zsched.host.workers.hired import FOLDER, relay_socket
+from zsched.host.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.bus.limits import in_turn_hz, limit_for
+from zsched.link.pipe.protocol import RelayHello
+from zsched.link.pipe.relay_socket import PROTOCOL, ask_relay
+from zsched.link.sessions import config as zenoh_config
+from zsched.link.sessions import tls as daemon_tls
+from zsched.link.sessions.access_rules import Side, common_names_of, names_of
+from zsched.link.sessions.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
+from zsched.link.sessions.memory import shared_memory_objection
+from zsched.link.sessions.sealing import seals_of
+from zsched.link.sessions.secured import CREDENTIALS, digest_of, require_own
+from zsched.link.sessions.zenoh_file import denied_by, operator_json5
 from zsched.runtime.access import StreamAccess, joins_at
-from zsched.runtime.access_rules import Side, common_names_of, names_of
 from zsched.runtime.adoption import Adoption, tell_orders
 from zsched.runtime.descriptors import take_descriptors
 from zsched.runtime.desk import Desk
-from zsched.runtime.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.runtime.inbox import INBOX_LIMIT, Inbox
 from zsched.runtime.leaving import Leaving, Told
 from zsched.runtime.library import Library
-from zsched.runtime.membership import copied_file
-from zsched.runtime.memory import shared_memory_objection
 from zsched.runtime.recipes import Recipes
+from zsched.runtime.relay.streams import SILENCE_S, RelayHandle
 from zsched.runtime.reload import Reload
 from zsched.runtime.restoring import Restored, Stored, read_stored, restore
 from zsched.runtime.sampler import Sampler
-from zsched.runtime.sealing import seals_of
-from zsched.runtime.secured import CREDENTIALS, digest_of, require_own
 from zsched.runtime.session_watch import SessionWatch
 from zsched.runtime.sessions import SessionsRead
 from zsched.runtime.shell import Shell
 from zsched.runtime.strikes import Strikes
-from zsched.runtime.zenoh_file import denied_by, operator_json5
-from zsched.screen import fitted
-from zsched.sessions import config as zenoh_config
 
 NAME_TAKEN_WAIT_S = 5.0
 CLOSE_WORKERS_S = 0.7
@@ -594,7 +594,7 @@ def main(arguments: list[str] | None = None) -> int:
         state_dir=places.state_folder(given.state_dir, os.environ),
         runtime_dir=places.runtime_folder(given.runtime_dir, os.environ),
     )
-    # Where a renewed certificate is looked for (`zsched.runtime.secured`), whatever the state folder was named by.
+    # Where a renewed certificate is looked for (`zsched.link.sessions.secured`), however the state folder was named.
     os.environ["ZSCHED_STATE_DIR"] = str(options.state_dir)
     try:
         daemon = Daemon(options)

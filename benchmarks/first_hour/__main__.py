@@ -103,7 +103,7 @@ with zenoh.open(config) as session:
 
 def own_fleet(example: str, streams: str) -> str:
     """The example's fleet file with another task and its streams, as its author changes it."""
-    text = (REPO / "zsched" / "examples" / example / "fleet.yaml").read_text()
+    text = (REPO / "zsched" / "tools" / "examples" / example / "fleet.yaml").read_text()
     head, _, _ = text.partition("    # What the task needs at least")
     return head.replace("  shout:\n", "  mean:\n") + streams
 

@@ -12,8 +12,8 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.common import CliError, Verb, Verbs
-from zsched.exits import EXIT_USAGE
+from zsched.commands.base.common import CliError, Verb, Verbs
+from zsched.core.values.exits import EXIT_USAGE
 
 
 class MergeMode(StrEnum):

@@ -14,15 +14,15 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from zsched.adapters.host.state_file import StateFile
-from zsched.adapters.host.systemd import Notifier, watchdog_interval_s
-from zsched.adapters.machine.device_profiler import DeviceProfiler
-from zsched.adapters.radio.network_profiler import readers_for
-from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import LinkSpec, NodeSpec, WorkerSpec
 from zsched.core.values.model import NodeKind
 from zsched.core.values.profile import LinkSource, WorkerState
+from zsched.host.machine.device_profiler import DeviceProfiler
+from zsched.host.radio.network_profiler import readers_for
+from zsched.host.state_file import StateFile
+from zsched.host.systemd import Notifier, watchdog_interval_s
+from zsched.host.workers.supervisor import WorkerContext, WorkerSupervisor
 
 WORKER = """
 import json, os, pathlib, subprocess, time

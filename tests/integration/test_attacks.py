@@ -27,24 +27,24 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from support.authorities import install, make_authority
 from support.waiting import free_endpoint, until
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.limits import Limit, limit_for
 from zsched.config.load import check_file
-from zsched.core import events as ev
-from zsched.core.events import RoleEnded
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
 from zsched.core.values.certificates import Role
+from zsched.core.values.events import RoleEnded
 from zsched.core.values.fleet import Fleet, WorkerLink
 from zsched.core.values.messages import Learnt, MoveTask
 from zsched.core.values.model import Asked
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.bus.limits import Limit, limit_for
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions import config as zenoh_config
+from zsched.link.sessions import expulsion
+from zsched.link.sessions.access_rules import Side, common_names_of, names_of
+from zsched.link.sessions.expulsion import HOLD_S, MAX_SHOWN, Expulsion, Refusal, members_of
+from zsched.link.sessions.tls import session_text
 from zsched.pki.authority import Authority
 from zsched.relay import tokens
-from zsched.runtime.access_rules import Side, common_names_of, names_of
-from zsched.runtime.tls import session_text
-from zsched.sessions import config as zenoh_config
-from zsched.sessions import expulsion
-from zsched.sessions.expulsion import HOLD_S, MAX_SHOWN, Expulsion, Refusal, members_of
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 
 FLEET = """\
 fleet: yard

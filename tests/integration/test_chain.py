@@ -19,12 +19,12 @@ import pytest
 import zenoh
 
 from support.waiting import within
-from zsched.adapters.host.operator_client import ask
+from zsched.core.values import codec as wire
 from zsched.core.values.model import Proposal
-from zsched.paths import socket_path
-from zsched.sessions import config as zenoh_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.host.operator_client import ask
+from zsched.host.paths import socket_path
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.testbed import DAEMON, Testbed, echo_fleet
 

@@ -20,7 +20,7 @@ from typing import Self
 import pytest
 
 from support.waiting import until
-from zsched.commands.example import Example, write_example
+from zsched.tools.example import Example, write_example
 
 pytestmark = pytest.mark.long
 

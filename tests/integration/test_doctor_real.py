@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

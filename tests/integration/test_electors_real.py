@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from zsched.adapters.network.fleet_client import FleetClient
 from zsched.core.values.document import Document, Text
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
-from zsched.sessions import config as zenoh_config
+from zsched.link.bus.fleet_client import FleetClient
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

@@ -14,9 +14,9 @@ import pytest
 from support.authorities import install, make_authority
 from support.fleets import fleet_of
 from zsched.core.values.fleet import Security
-from zsched.runtime.access_rules import Side
-from zsched.runtime.secured import secured_text
-from zsched.sessions.config import control_config
+from zsched.link.sessions.access_rules import Side
+from zsched.link.sessions.config import control_config
+from zsched.link.sessions.secured import secured_text
 from zsched_lab.fleet import netns
 
 pytestmark = [pytest.mark.long, pytest.mark.root]

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from zsched.adapters.host.document_store import DocumentStore
-from zsched.adapters.host.state_file import StateFile
+from zsched.core.values import codec as wire
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 from zsched.core.values.model import NodeId
-from zsched.sessions.config import client_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.host.document_store import DocumentStore
+from zsched.host.state_file import StateFile
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 ROBOTS = ("robot1", "robot2", "robot3")

@@ -12,10 +12,10 @@ from support.authorities import secured
 from support.ballots import ballot_of
 from support.beats import beat_of
 from support.proposals import proposal_of
+from zsched.core.values import codec as wire
 from zsched.core.values.messages import Prepare
-from zsched.runtime.access_rules import Side
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.access_rules import Side
 from zsched_lab.fleet.secured import without_rules
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 

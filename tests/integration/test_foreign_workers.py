@@ -26,7 +26,7 @@ from support.verbs import command
 from support.waiting import free_endpoint, until
 from zsched.core.route.ros2 import Endpoint, EndpointKind, default_qos, endpoint_token
 from zsched.core.values.plan import RosGraph
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

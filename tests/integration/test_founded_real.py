@@ -10,8 +10,8 @@ import pytest
 import zenoh
 
 from support.waiting import until
-from zsched.exits import EXIT_LEFT
-from zsched.sessions.config import client_config
+from zsched.core.values.exits import EXIT_LEFT
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 
 LOCAL_AFTER = 3

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.runtime.init import init_state
+from zsched.commands.members.blank import init_state
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.testbed import DAEMON, Testbed, TestbedError, echo_fleet
 

@@ -10,8 +10,8 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.hop.acknowledger import Acknowledger
-from zsched.sessions.stalled_links import StalledLinks
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.sessions.stalled_links import StalledLinks
 from zsched.worker.keep import Debts, Keeper
 from zsched.worker.outputs import Output, OutputOptions
 

@@ -18,9 +18,7 @@ import zenoh
 from support.books import assert_nothing_is_unaccounted
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import ProblemReported, RelayChanged, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.events import ProblemReported, RelayChanged, SlotFlipped, SlotReady
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import (
     Direction,
@@ -32,7 +30,9 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.sessions.config import client_config, data_config, local_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.link.sessions.config import client_config, data_config, local_config, worker_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.relays import hello_of
 
 ROBOTS = ("robot1", "robot2", "robot3")

@@ -12,9 +12,9 @@ import zenoh
 from support.operators import Stream
 from support.sessions import matches
 from support.waiting import until
-from zsched.exits import EXIT_LEFT
-from zsched.sessions.config import client_config
-from zsched.wire.codec import decode_state
+from zsched.core.values.codec import decode_state
+from zsched.core.values.exits import EXIT_LEFT
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 
 pytestmark = pytest.mark.long

@@ -16,7 +16,7 @@ import pytest
 
 from support.rights import WITHOUT_RIGHTS
 from support.waiting import until
-from zsched.commands.example import Example, write_example
+from zsched.tools.example import Example, write_example
 
 pytestmark = pytest.mark.long
 

@@ -14,11 +14,11 @@ import psutil
 import pytest
 
 from support.waiting import TooSlowError
-from zsched.adapters.host.decision_log import NAME, Entry
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.utility import SPARE
+from zsched.core.values.codec import from_plain
 from zsched.core.values.quorum import majority
-from zsched.wire.codec import from_plain
+from zsched.host.decision_log import NAME, Entry
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 TASKS = ("task1", "task2", "task3")

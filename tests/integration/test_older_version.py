@@ -15,7 +15,7 @@ import pytest
 
 from support.operators import Operator
 from support.waiting import until
-from zsched.adapters.host.state_file import hardware_id
+from zsched.host.state_file import hardware_id
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

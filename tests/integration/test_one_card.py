@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.operator_client import ask
-from zsched.paths import socket_path
+from zsched.host.operator_client import ask
+from zsched.host.paths import socket_path
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import Netbed
 from zsched_lab.fleet.testbed import echo_fleet

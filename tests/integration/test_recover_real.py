@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.network.fleet_client import FleetClient
+from zsched.core.values.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.core.values.messages import CommandOutcome, CommandResult, MoveTask
 from zsched.core.values.model import Asked, NodeId
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.sessions import config as zenoh_config
+from zsched.link.bus.fleet_client import FleetClient
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

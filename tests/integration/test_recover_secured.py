@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from support.authorities import install, make_authority
+from zsched.core.values.exits import EXIT_OK, EXIT_WOULD_CHANGE
 from zsched.core.values.model import NodeId
-from zsched.exits import EXIT_OK, EXIT_WOULD_CHANGE
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

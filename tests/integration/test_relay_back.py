@@ -10,9 +10,9 @@ import pytest
 
 from support.relay_rig import ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.waiting import until
-from zsched.clock import monotonic_s
-from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
+from zsched.core.values.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
+from zsched.host.clock import monotonic_s
 
 pytestmark = pytest.mark.long
 

@@ -11,9 +11,7 @@ import zenoh
 
 from support.books import assert_nothing_is_unaccounted
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -24,7 +22,9 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
-from zsched.sessions.config import data_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.link.sessions.config import data_config, worker_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.relays import hello_of
 
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=500)

@@ -12,9 +12,9 @@ import zenoh
 from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until
-from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.values.plan import ReadyWhen, RoutePhase, StreamClass
 from zsched.core.values.plan import Slot as OneSlot
+from zsched.core.values.relay_protocol import WorkerWatch
 
 
 @pytest.fixture

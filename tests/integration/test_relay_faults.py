@@ -18,7 +18,7 @@ import pytest
 import zsched
 from support.waiting import within
 from zsched.core.values.model import NodeId
-from zsched.ipc.relay_socket import PROTOCOL
+from zsched.link.pipe.relay_socket import PROTOCOL
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 
@@ -205,7 +205,7 @@ def test_an_upgrade_that_replaces_a_robots_relay_loses_no_answer_that_had_come(
 def with_another_protocol(folder: Path) -> Path:
     """Where a package is whose daemons cannot go on with the relays of this one."""
     shutil.copytree(Path(zsched.__file__).parent, folder / "zsched", ignore=shutil.ignore_patterns("__pycache__"))
-    path = folder / "zsched/ipc/relay_socket.py"
+    path = folder / "zsched/link/pipe/relay_socket.py"
     text = path.read_text()
     path.write_text(text.replace(f"PROTOCOL: Final = {PROTOCOL}\n", f"PROTOCOL: Final = {PROTOCOL + 1}\n"))
     assert path.read_text() != text

@@ -12,9 +12,9 @@ import pytest
 
 from support.relay_rig import Application, Rig, relay_rig, slot
 from support.waiting import until
-from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import SlotLost
+from zsched.core.values.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.plan import RoutePhase, StreamClass, WorkerRole
+from zsched.core.values.relay_protocol import SlotLost
 
 FROZEN_S = 4.0
 """Longer than the lease: its link ends, and whatever is on its way goes with it."""

@@ -15,8 +15,8 @@ import pytest
 
 from support.relay_rig import FLEET, TASK, relay_rig
 from support.waiting import until
-from zsched.core.events import ProblemReported, StreamsCounted
-from zsched.core.relay_protocol import RelayStarted, RelayStop, TaskEnded
+from zsched.core.values import codec as wire
+from zsched.core.values.events import ProblemReported, StreamsCounted
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -28,12 +28,12 @@ from zsched.core.values.plan import (
     StreamSettings,
     WorkerRole,
 )
-from zsched.ipc.pipe import REPORTS, read_frame, set_timeout, write_frame
-from zsched.ipc.protocol import RelayHere, RelayPulse
-from zsched.ipc.relay_socket import ask_relay, dial
-from zsched.sessions.config import data_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.core.values.relay_protocol import RelayStarted, RelayStop, TaskEnded
+from zsched.link.keyspace import Keyspace
+from zsched.link.pipe.frames import REPORTS, read_frame, set_timeout, write_frame
+from zsched.link.pipe.protocol import RelayHere, RelayPulse
+from zsched.link.pipe.relay_socket import ask_relay, dial
+from zsched.link.sessions.config import data_config
 from zsched_lab.fleet.relays import hello_of
 
 ROUTE = Route(

@@ -16,7 +16,7 @@ from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
 from support.waiting import POLL_S, TooSlowError, between, until, within
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import StreamClass
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 
 pytestmark = pytest.mark.long
 

@@ -20,11 +20,11 @@ from support.beside import COUPLED, Beside
 from support.relay_rig import BESIDE, FLEET, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until, within
-from zsched.core.relay_protocol import SlotLost, StreamAck, StreamAcks, WorkerSeen
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import ReadyWhen, RoutePhase, RoutePlan, StreamClass, StreamCount
-from zsched.sessions.config import worker_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.core.values.relay_protocol import SlotLost, StreamAck, StreamAcks, WorkerSeen
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.config import worker_config
 
 WHAT_FITS = 5500
 """Of 10 kB: in flight 1677 (16 MiB), in the queue 1024, before it 256, the rest in sockets and at the worker."""

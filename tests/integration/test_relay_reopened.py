@@ -14,12 +14,12 @@ import pytest
 
 from support.relay_rig import FLEET, ROBOT, TASK, Application, Reports, Rig, slot
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotReady
-from zsched.core.relay_protocol import RelayStarted
+from zsched.core.values.events import RelayChanged, SlotReady
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import OnCrash, RoutePhase, Slot, StreamClass
-from zsched.sessions.config import client_config, data_config, local_config
+from zsched.core.values.relay_protocol import RelayStarted
+from zsched.link.sessions.config import client_config, data_config, local_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.relays import hello_of
 
 HZ = 100.0

@@ -13,9 +13,9 @@ import zenoh
 from support.relay_rig import ROBOT, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import until
-from zsched.core.events import SlotFlipped, SlotReady
-from zsched.core.relay_protocol import SlotLost
+from zsched.core.values.events import SlotFlipped, SlotReady
 from zsched.core.values.plan import OnCrash, RoutePhase, Slot, StreamClass, WorkerRole
+from zsched.core.values.relay_protocol import SlotLost
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import zenoh
 
 from support.sessions import matches
 from support.waiting import until
-from zsched.core.events import SlotDrained, SlotReady, StreamsCounted
+from zsched.core.values.events import SlotDrained, SlotReady, StreamsCounted
 from zsched.core.values.plan import (
     Direction,
     ReadyWhen,
@@ -25,7 +25,7 @@ from zsched.core.values.plan import (
     Slot,
     StreamSettings,
 )
-from zsched.sessions.config import worker_config
+from zsched.link.sessions.config import worker_config
 from zsched_lab.fleet.relays import ROBOT, Relays
 
 TASK = "jobs"

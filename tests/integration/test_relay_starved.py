@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.adapters.relay import streams
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import ProblemReported, RelayChanged
-from zsched.core.relay_protocol import HandleReport
-from zsched.errors import AdapterError
-from zsched.sessions.config import data_config
+from zsched.core.values.errors import AdapterError
+from zsched.core.values.events import ProblemReported, RelayChanged
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.link.sessions.config import data_config
+from zsched.runtime.relay import streams
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.relays import hello_of
 

@@ -15,8 +15,7 @@ import zenoh
 from support.relay_rig import BESIDE, ROBOT, TASK, Application, Rig, relay_rig, slot
 from support.sessions import matches
 from support.waiting import between, until, within
-from zsched.core.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import WorkerWatch
+from zsched.core.values.events import RelayChanged, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.plan import (
     ReadyWhen,
     RoutePhase,
@@ -24,7 +23,8 @@ from zsched.core.values.plan import (
     StreamClass,
     WorkerRole,
 )
-from zsched.sessions.config import DEFAULT_TIMING, worker_config
+from zsched.core.values.relay_protocol import WorkerWatch
+from zsched.link.sessions.config import DEFAULT_TIMING, worker_config
 
 WAITS_S = 5.0
 """Half of such a link's lease."""

@@ -20,16 +20,16 @@ import zenoh
 
 from support.relay_rig import FLEET, ROBOT, TASK, Application, slot
 from support.waiting import free_endpoint, until
-from zsched.core.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.hop.books import unaccounted
 from zsched.core.hop.serial import SPAN
 from zsched.core.hop.shared import SharedSender
+from zsched.core.values.events import SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, Slot, StreamClass, StreamCount, WorkerRole
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.relay.process import RelayProcess
 from zsched.relay.streams import outlet
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outputs import OutputStream
-from zsched.sessions.config import data_config, worker_config
 from zsched.tasks.echo import Echo
 from zsched.worker import Worker
 from zsched.worker import keep as worker_keep

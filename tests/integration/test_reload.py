@@ -18,7 +18,7 @@ from support.operators import Stream
 from support.sessions import matches
 from zsched.core.executor.renewing import SAME_FILE_S
 from zsched.core.hop.books import unaccounted
-from zsched.wire.keyspace import Keyspace
+from zsched.link.keyspace import Keyspace
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 Tree = dict[str, Any]

@@ -20,7 +20,7 @@ import zenoh
 
 from support.authorities import secured
 from support.operators import Operator, Stream
-from zsched.adapters.host.operator_client import ask
+from zsched.core.values import codec as wire
 from zsched.core.values.messages import (
     COMMANDS,
     Accept,
@@ -34,9 +34,9 @@ from zsched.core.values.messages import (
     Promise,
     Refused,
 )
-from zsched.runtime.access_rules import Side
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.host.operator_client import ask
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.access_rules import Side
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.secured import without_rules
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import OnboardBed, Probe
 from zsched_lab.fleet.testbed import TASK, echo_fleet

@@ -17,15 +17,15 @@ from zenoh import ext
 
 from support.books import assert_nothing_is_unaccounted
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
 from zsched.config.load import load_fleet
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport
 from zsched.core.route.ros2 import Attachment, decode_attachment, encode_attachment
 from zsched.core.route.route import plan_for, slot_for
+from zsched.core.values.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.values.fleet import LocalSide
 from zsched.core.values.plan import Role, RoutePhase, WorkerRole
-from zsched.sessions.config import client_config, data_config, local_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.link.sessions.config import client_config, data_config, local_config, worker_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid

@@ -20,8 +20,8 @@ from zenoh import ext
 from support.ros_host import RosHost, opened
 from support.waiting import until
 from zsched.core.route.ros2 import Attachment, decode_attachment, encode_attachment
-from zsched.sessions.config import client_config, worker_config
-from zsched.sessions.matching import is_matched
+from zsched.link.sessions.config import client_config, worker_config
+from zsched.link.sessions.matching import is_matched
 
 GRID = "nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7"
 TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"

@@ -16,19 +16,19 @@ import pytest
 import zenoh
 
 from support.authorities import install, secured
-from zsched.adapters.host.operator_client import ask
-from zsched.commands.ask import Door, _client, _visit, ask_door
-from zsched.commands.change import user_name
+from zsched.commands.base.change import user_name
+from zsched.commands.base.ask import Door, _client, _visit, ask_door
 from zsched.config.load import load_fleet
+from zsched.core.values import codec as wire
 from zsched.core.values.certificates import Role
 from zsched.core.values.messages import Accept, Prepare, Promise
 from zsched.core.values.model import Ballot
+from zsched.host.operator_client import ask
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.access_rules import Side
+from zsched.link.sessions.config import client_config
+from zsched.link.sessions.tls import session_text
 from zsched.pki.authority import opened
-from zsched.runtime.access_rules import Side
-from zsched.runtime.tls import session_text
-from zsched.sessions.config import client_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.secured import without_rules
 from zsched_lab.fleet.testbed import TASK, Json, Testbed, echo_fleet
 

@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 from support.waiting import until
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 LARGE = bytes(1 << 18)

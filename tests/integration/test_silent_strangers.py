@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.link.sessions import config as zenoh_config
 from zsched.runtime.descriptors import WANTED
-from zsched.sessions import config as zenoh_config
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

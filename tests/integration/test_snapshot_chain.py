@@ -12,8 +12,8 @@ import zenoh
 
 from support.authorities import secured
 from support.verbs import command, move
-from zsched import paths
-from zsched.adapters.host.operator_client import ask
+from zsched.host import paths
+from zsched.host.operator_client import ask
 from zsched.worker.snapshot import TIMEOUT_S
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 

@@ -15,12 +15,12 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched.core.relay_protocol import WorkerTrouble
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.ipc.pipe import decode_word
-from zsched.sessions.config import data_config, worker_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.link.keyspace import Keyspace
+from zsched.link.pipe.frames import decode_word
+from zsched.link.sessions.config import data_config, worker_config
 
 TASK, FLEET = "sum", "test"
 KEYS = Keyspace(FLEET)

@@ -15,7 +15,7 @@ import zenoh
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched.sessions.config import client_config, data_config
+from zsched.link.sessions.config import client_config, data_config
 
 pytestmark = pytest.mark.long
 
@@ -26,7 +26,7 @@ A_READ = 1500
 SUBSCRIBER = """
 import sys, time
 import zenoh
-from zsched.sessions.link_sockets import LinkSockets
+from zsched.link.sessions.link_sockets import LinkSockets
 
 counts, keys = [0, 0], int(sys.argv[3])
 

@@ -17,10 +17,10 @@ import zenoh
 from support.readers import Reader
 from support.relay_rig import FLEET, ROBOT, Application, Rig, slot
 from support.waiting import free_endpoint, until, within
-from zsched.adapters.relay.streams import RelayHandle
 from zsched.core.values.fleet import LocalMode, LocalSide, Timing
 from zsched.core.values.plan import StreamClass
-from zsched.sessions.config import client_config, local_config
+from zsched.link.sessions.config import client_config, local_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.relays import hello_of
 
 pytestmark = pytest.mark.long

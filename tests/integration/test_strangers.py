@@ -19,13 +19,13 @@ import zenoh
 from support.allocations import allocation_of
 from support.beats import beat_of
 from support.profiles import profile_of
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.core.values import codec as wire
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.ipc.pipe import encode_end
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK, Keyspace
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.link.keyspace import END_CHUNK, Keyspace
+from zsched.link.pipe.frames import encode_end
 from zsched_lab.fleet.testbed import TASK, Testbed, echo_fleet
 
 pytestmark = pytest.mark.long

@@ -25,16 +25,12 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.proposals import proposal_of
 from support.states import state_of
 from support.waiting import free_endpoint, until
-from zsched.adapters.host.decision_log import DecisionLog
-from zsched.adapters.host.state_file import StateFile
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.seals import Seals
-from zsched.clock import monotonic_s
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.certificates import Role
 from zsched.core.values.fleet import Fleet, Security, electorate_hash
 from zsched.core.values.in_force import InForce
@@ -52,15 +48,19 @@ from zsched.core.values.messages import (
     fleet_question,
 )
 from zsched.core.values.model import Acceptance, Allocation, Asked, RegisterState
+from zsched.host.clock import monotonic_s
+from zsched.host.decision_log import DecisionLog
+from zsched.host.state_file import StateFile
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.bus.seals import Seals
+from zsched.link.keyspace import Keyspace
+from zsched.link.seal import Act
+from zsched.link.sessions.config import control_config
+from zsched.link.sessions.sealing import seals_of
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk
 from zsched.runtime.inbox import Inbox
 from zsched.runtime.library import Library
-from zsched.runtime.sealing import seals_of
 from zsched.runtime.shell import Shell
-from zsched.sessions.config import control_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
-from zsched.wire.seal import Act
 
 pytestmark = pytest.mark.long
 NODES = ("edge1", "edge2", "robot1", "robot2", "robot3")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.sessions.config import TX_THREADS, daemon_pools, pool_threads, worker_pools
+from zsched.link.sessions.config import TX_THREADS, daemon_pools, pool_threads, worker_pools
 from zsched_lab.fleet.netbed import descendants_running
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 

@@ -26,7 +26,7 @@ import zenoh
 
 from zsched.core.route import ros2
 from zsched.core.values.plan import RosGraph
-from zsched.sessions.config import client_config
+from zsched.link.sessions.config import client_config
 
 T = TypeVar("T")
 DISTROS = ("humble", "kilted")

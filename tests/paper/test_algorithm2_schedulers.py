@@ -13,13 +13,13 @@ from support.profiles import load_of, profile_of
 from support.proposals import proposal_of, vector_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.judge import Judge, Outcome
 from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import compare, pick
 from zsched.core.values.fleet import Timing, WorkerSpec
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, PeerState, Proposal, Tuning, UtilityVector, Weights
 from zsched.core.values.profile import Link, LinkSource

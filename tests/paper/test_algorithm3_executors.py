@@ -13,12 +13,19 @@ from support.robots import Decider
 from support.todos import done
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import ApplyRoutes, AskUtilities, Instruction, PublishProposal, StartWorker, StopWorker
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.values.change import MoveOwner, Retune
 from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import (
+    ApplyRoutes,
+    AskUtilities,
+    Instruction,
+    PublishProposal,
+    StartWorker,
+    StopWorker,
+)
 from zsched.core.values.model import Allocation, PeerState, Proposal
 from zsched.core.values.plan import Direction, RoutePhase, RoutePlan
 from zsched.core.values.profile import DeviceSample, LinkSample, LinkSource, WorkerState

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from support.waiting import until
-from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.host.state_file import StateFile
 from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 MAIN = "from zsched.__main__ import main; main()"

@@ -24,21 +24,24 @@ import zenoh
 from support.fleets import fleet_of, node_of
 from support.sessions import matches
 from support.waiting import until
-from zsched import clock, daemon
-from zsched.adapters.host.operator_client import ask
-from zsched.adapters.host.state_file import StateFile
-from zsched.clock import ClockWatch, Drift, SleepWatch
-from zsched.core import events as ev
+from zsched import daemon
+from zsched.core.values import events as ev
+from zsched.core.values.errors import AdapterError
+from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.core.values.fleet import Fleet, LinkSpec, NodeSpec
 from zsched.core.values.model import NodeKind
 from zsched.core.values.profile import DeviceSample, LinkSource
 from zsched.core.vote.clocks import is_bad
-from zsched.errors import AdapterError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
-from zsched.ipc.relay_socket import relay_pid
-from zsched.log_limit import BURST, RATE_HZ
-from zsched.paths import relay_path, socket_path
-from zsched.runtime.endpoints import (
+from zsched.host import clock
+from zsched.host.clock import ClockWatch, Drift, SleepWatch
+from zsched.host.log_limit import BURST, RATE_HZ
+from zsched.host.operator_client import ask
+from zsched.host.paths import relay_path, socket_path
+from zsched.host.state_file import StateFile
+from zsched.link.keyspace import Keyspace
+from zsched.link.pipe.relay_socket import relay_pid
+from zsched.link.sessions.config import worker_config
+from zsched.link.sessions.endpoints import (
     MAX_PORT,
     MIN_PORT,
     PORT_RANGE,
@@ -50,8 +53,6 @@ from zsched.runtime.endpoints import (
 )
 from zsched.runtime.inbox import Inbox
 from zsched.runtime.sampler import Sampler
-from zsched.sessions.config import worker_config
-from zsched.wire.keyspace import Keyspace
 from zsched_lab.fleet.testbed import echo_fleet
 
 Json = dict[str, Any]
@@ -426,7 +427,7 @@ if "BEGUN" not in os.environ:
     os.environ["BEGUN"], SessionWatch.is_due = "1", lambda *_: DUE
     sys.exit(daemon.main(sys.argv[1:]))
 from pathlib import Path
-from zsched.ipc.relay_socket import relay_pid
+from zsched.link.pipe.relay_socket import relay_pid
 for pid in filter(None, map(relay_pid, Path(sys.argv[-1]).glob("*.relay"))):
     os.kill(pid, signal.SIGKILL)  # it has our stderr, of which the test waits for the end
 """

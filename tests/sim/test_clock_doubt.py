@@ -10,8 +10,8 @@ import pytest
 from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.events import ClockCompared, HoldCommanded, MoveCommanded
 from zsched.core.values.beat import Beat, Grant
+from zsched.core.values.events import ClockCompared, HoldCommanded, MoveCommanded
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import RHO, hold_s

@@ -11,7 +11,7 @@ import pytest
 
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.events import BeatReceived
+from zsched.core.values.events import BeatReceived
 from zsched.core.values.fleet import Fleet, Timing, WorkerSpec
 from zsched.core.values.lease import hold_s
 from zsched.core.values.model import NodeId

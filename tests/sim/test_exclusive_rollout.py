@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import NodeId

@@ -10,8 +10,8 @@ import pytest
 from support.plays import FLEET, ROBOTS, TASK, Play
 from support.slices import slices
 from zsched.config.timing import WAN
-from zsched.core import events as ev
 from zsched.core.electorate.documents import Documents
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, TuneTask
 from zsched.core.values.model import Aggregate, Asked

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.struct import replace

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from support.fleets import fleet_of, task_of
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
 from zsched.core.values.fleet import Fleet, OnIsolation, WorkerSpec
 from zsched.core.values.plan import WorkerRole
 from zsched_lab.sim.simulator import Simulator

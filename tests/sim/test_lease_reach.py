@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.events import HoldCommanded, MoveCommanded
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
+from zsched.core.values.events import HoldCommanded, MoveCommanded
 from zsched.core.values.messages import Hold, HoldTask, MoveTask
 from zsched.core.values.model import Asked
 from zsched_lab.sim import missed_electors

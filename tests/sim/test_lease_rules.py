@@ -11,13 +11,13 @@ from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.todos import done, todo_of
-from zsched.core import instructions as do
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import Tenure
-from zsched.core.instructions import SetRole
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec, lease_terms
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import SetRole
 from zsched.core.values.lease import RHO, hold_s
 from zsched.core.values.plan import WorkerRole
 from zsched.core.vote.lease import LIVES_KEPT, SENT_KEPT, Granter, Holder, Leases

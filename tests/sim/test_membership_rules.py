@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.model import PeerState
 from zsched_lab.sim.simulator import Simulator
 from zsched_lab.sim.swarm import plan

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.handlers.work import FROM_A_PEER, _move_of
+from zsched.core.node.work import FROM_A_PEER, _move_of
 from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim.simulator import Simulator
 

@@ -8,9 +8,9 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core import events as ev
 from zsched.core.electorate.recovery import NEW_DISK, Sides, rejoined
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
+from zsched.core.values import events as ev
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, WorkerSpec

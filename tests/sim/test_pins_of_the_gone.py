@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from support.plays import EDGES, FLEET, TASK, Play
-from zsched.core.events import HoldCommanded
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
+from zsched.core.values.events import HoldCommanded
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome, Hold, HoldTask
 from zsched.core.values.model import Asked, NodeId

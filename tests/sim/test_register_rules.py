@@ -13,9 +13,9 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.registers import Step, did
 from support.states import state_of
 from support.todos import agreed
-from zsched.core.events import AcceptAsked, PrepareAsked
 from zsched.core.register.task_register import TaskRegister
 from zsched.core.values.change import MoveOwner
+from zsched.core.values.events import AcceptAsked, PrepareAsked
 from zsched.core.values.fleet import Timing, WorkerSpec, electorate_hash
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused

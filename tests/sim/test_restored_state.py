@@ -8,8 +8,8 @@ import pytest
 
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.in_force import InForce

@@ -21,7 +21,7 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.messages import TuneTask
 from zsched.core.values.model import Asked, Weights

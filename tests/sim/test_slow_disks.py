@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import NodeId
 from zsched_lab.sim.simulator import Simulator

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from zsched.core import status
+from zsched.core.node import status
 from zsched_lab.sim.faults import play
 from zsched_lab.sim.swarm import plan
 

@@ -12,11 +12,11 @@ import pytest
 
 from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
 from zsched.core.register.register import Register
-from zsched.core.todo import ToDo
+from zsched.core.values.errors import InvariantError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Prepare, Promise, Refused
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.belief import GENERATION_STEP
-from zsched.errors import InvariantError
 from zsched_lab.sim import simulate
 from zsched_lab.sim.checks import DisagreementError
 from zsched_lab.sim.faults import BEYOND, Stage, play

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from support.fleets import fleet_of, task_of
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
 from zsched.core.values.fleet import WorkerSpec
 from zsched_lab.sim.parts import Machine
 from zsched_lab.sim.simulator import Simulator

@@ -8,8 +8,8 @@ from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.proposals import proposal_of
 from support.robots import Decider
-from zsched.core import events as ev
 from zsched.core.gateway.gateway import Gateway
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, Proposal, Reach

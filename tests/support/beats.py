@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from zsched.core.events import BeatReceived
-from zsched.core.instructions import Instruction
-from zsched.core.node import Node
+from zsched.core.node.node import Node
 from zsched.core.values.beat import Beat
+from zsched.core.values.events import BeatReceived
+from zsched.core.values.instructions import Instruction
 from zsched.core.values.model import NodeId
 
 

@@ -19,7 +19,7 @@ from itertools import pairwise
 
 import zenoh
 
-from zsched.sessions.config import worker_config, worker_pools
+from zsched.link.sessions.config import worker_config, worker_pools
 
 PERIOD_S = 0.005
 COUPLED = "coupled"

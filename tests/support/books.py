@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from support.waiting import until
-from zsched.core.events import StreamsCounted
 from zsched.core.hop.books import unaccounted
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.events import StreamsCounted
 from zsched.core.values.plan import StreamCount
+from zsched.core.values.relay_protocol import HandleReport
 
 
 def newest_counts(reports: Iterable[HandleReport]) -> tuple[StreamCount, ...]:

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from zsched import __version__
-from zsched.adapters.host.state_file import StateFile, hardware_id
 from zsched.config.load import check_file
-from zsched.core.report import snapshot_json
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import WorkerLoad, WorkerState
+from zsched.core.values.report import snapshot_json
 from zsched.core.values.snapshot import NodeStatus, QuorumStatus, Snapshot, TaskStatus
 from zsched.core.vote.generations import blank_state
-from zsched.doctor.model import Json, Result, Scene, Verdict
-from zsched.doctor.table import CHECKS
+from zsched.host.state_file import StateFile, hardware_id
+from zsched.tools.doctor.model import Json, Result, Scene, Verdict
+from zsched.tools.doctor.table import CHECKS
 
 FLEET = """
 fleet: hall

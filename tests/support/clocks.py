@@ -6,11 +6,11 @@ import time
 
 import pytest
 
-from zsched import clock
+from zsched.host import clock
 
 
 class Clocks:
-    """In place of the kernel's, for `zsched.clock`; a wait goes by the real ones."""
+    """In place of the kernel's, for `zsched.host.clock`; a wait goes by the real ones."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.awake, self.slept = 1000.0, 0.0

@@ -10,7 +10,7 @@ from typing import Final
 
 import pytest
 
-from zsched.adapters.host.operator_socket import Json, OperatorSocket
+from zsched.host.operator_socket import Json, OperatorSocket
 
 STATUS: Final[Json] = json.loads(
     (Path(__file__).parents[1] / "unit" / "commands" / "recorded_status" / "healthy.json").read_text()

@@ -10,12 +10,12 @@ from pathlib import Path
 import zenoh
 
 from support.waiting import free_endpoint, until
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.ipc.pipe import decode_end, encode_end
-from zsched.sessions.config import data_config, worker_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK, Keyspace
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.link.keyspace import END_CHUNK, Keyspace
+from zsched.link.pipe.frames import decode_end, encode_end
+from zsched.link.sessions.config import data_config, worker_config
 
 KEYS = Keyspace("test")
 ROLE_KEY = KEYS.role("edge1", "t")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from support.fleets import fleet_of, tuning_of
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.document import Document, Flag
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult

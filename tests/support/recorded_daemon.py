@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
-from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.host.operator_socket import OperatorSocket
 
 RECORDED = Path(__file__).parents[1] / "unit" / "commands" / "recorded_status"
 Json = dict[str, Any]

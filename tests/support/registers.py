@@ -10,13 +10,13 @@ from typing import Any
 from support.allocations import allocation_of
 from support.ballots import ballot_of
 from support.fleets import tuning_of
-from zsched.core.instructions import SendAccept, SendPrepare
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, RoundOutcome
 from zsched.core.values.fleet import Timing
+from zsched.core.values.instructions import SendAccept, SendPrepare
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
+from zsched.core.values.todo import ToDo
 
 ELECTORS = ("r1", "r2", "r3")
 TUNING = tuning_of()

@@ -19,7 +19,7 @@ import zenoh
 
 from support.books import newest_counts, wait_for_balance
 from support.waiting import until
-from zsched.core.events import SlotDrained
+from zsched.core.values.events import SlotDrained
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import (
     Direction,
@@ -33,7 +33,7 @@ from zsched.core.values.plan import (
     StreamCount,
     StreamSettings,
 )
-from zsched.sessions.config import DEFAULT_TIMING
+from zsched.link.sessions.config import DEFAULT_TIMING
 from zsched_lab.fleet.relays import FLEET, ROBOT, TASK, Relays, Reports
 
 __all__ = ["BESIDE", "FLEET", "ROBOT", "TASK", "Application", "Reports", "Rig", "relay_rig", "slot"]

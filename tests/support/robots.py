@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from random import Random
 
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import Instruction
 from zsched.core.scheduler.rounds import Rounds
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import Instruction
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.voting import Votes
 
 

@@ -17,13 +17,13 @@ import zenoh
 from support.books import assert_nothing_is_unaccounted
 from support.relay_rig import Reports
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
 from zsched.config.load import check_bytes
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.route.route import plan_for, slot_for
+from zsched.core.values.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.values.fleet import LocalSide
 from zsched.core.values.plan import RoutePhase, Slot
-from zsched.sessions.config import client_config, data_config, local_config
+from zsched.link.sessions.config import client_config, data_config, local_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.relays import hello_of
 
 ROBOT = "robot1"

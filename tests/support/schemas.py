@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from zsched.commands.common import SCHEMAS
+from zsched.commands.base.common import SCHEMAS
 
 
 def closed(schema: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import zenoh
 
 from support.waiting import free_endpoint
-from zsched.sessions.config import data_config, worker_config
+from zsched.link.sessions.config import data_config, worker_config
 
 
 def opened(text: str, **more: str) -> zenoh.Session:

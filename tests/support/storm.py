@@ -12,10 +12,11 @@ from support.beats import beat_of
 from support.fleets import fleet_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Grant
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.electorate import FleetValue
@@ -44,7 +45,6 @@ from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, Tuni
 from zsched.core.values.plan import Direction, ReadyWhen, StreamCount
 from zsched.core.values.profile import DeviceSample, TaskProgress, WorkerState
 from zsched.core.values.rehearsal import FAULTS, KeepRehearsal, ReadRehearsals, Strike
-from zsched.wire import codec as wire
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 NAMES = (*ROBOTS, *EDGES, "ghost")

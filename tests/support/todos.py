@@ -1,13 +1,13 @@
-"""One call into a stage, and what it has left to do. Knows: `zsched.core.todo`, and what the node does with ends."""
+"""One call into a stage, and what it leaves to do (`zsched.core.values.todo`), and what the node does with ends."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from zsched.core.instructions import Instruction
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet
+from zsched.core.values.instructions import Instruction
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.agreement import Agreement
 
 

@@ -9,9 +9,9 @@ from enum import Enum
 from hashlib import blake2s
 from typing import Any, Final, Union, get_args, get_origin
 
-from zsched.ipc.pipe import COMMANDS, REPORTS
-from zsched.ipc.protocol import RelayHello, RelayHere, RelayQuestion, RelayRefused
-from zsched.wire import codec as wire
+from zsched.core.values import codec as wire
+from zsched.link.pipe.frames import COMMANDS, REPORTS
+from zsched.link.pipe.protocol import RelayHello, RelayHere, RelayQuestion, RelayRefused
 
 _GREETINGS: Final[tuple[type[Any], ...]] = (RelayHello, RelayQuestion, RelayHere, RelayRefused)
 

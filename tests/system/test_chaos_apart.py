@@ -19,11 +19,11 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.operator_client import ask
-from zsched.adapters.host.state_file import StateFile
-from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
-from zsched.paths import socket_path
+from zsched.host.clock import monotonic_s
+from zsched.host.operator_client import ask
+from zsched.host.paths import socket_path
+from zsched.host.state_file import StateFile
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.chaos import TWO_CLASSES
 from zsched_lab.fleet.netbed import Netbed, Probe, Received

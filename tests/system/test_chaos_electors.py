@@ -19,13 +19,13 @@ import msgpack
 import pytest
 
 from support.beats import beat_of
-from zsched.adapters.host.operator_client import ask
+from zsched.commands.members.blank import init_state
 from zsched.core.membership.identity import TOLD_YOUNG_S
-from zsched.paths import socket_path
-from zsched.runtime.init import init_state
-from zsched.sessions import config as zenoh_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.core.values import codec as wire
+from zsched.host.operator_client import ask
+from zsched.host.paths import socket_path
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.netbed import CONTROL_PORT, Netbed, Probe
 from zsched_lab.fleet.testbed import DAEMON, TASK, Json, echo_fleet

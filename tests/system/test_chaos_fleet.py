@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from zsched.clock import monotonic_s
 from zsched.core.values.model import PeerState
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.chaos import GUARD, ChaosBed
 from zsched_lab.fleet.groups import LimitedGroup

@@ -17,11 +17,11 @@ from typing import Final
 import pytest
 
 from support.waiting import within
-from zsched.clock import monotonic_s
 from zsched.core.hop.books import given_up
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import StreamCount
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.chaos import ChaosBed
 from zsched_lab.fleet.netbed import Netbed, Probe, descendants_running

@@ -14,7 +14,7 @@ import pytest
 
 from support.waiting import until
 from zsched.core.values.fleet import Timing
-from zsched.sessions import config as zenoh_config
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet import netns
 from zsched_lab.fleet.hall import Hall
 from zsched_lab.fleet.netbed import CONTROL_PORT, DATA_PORT, PROBE, Probe

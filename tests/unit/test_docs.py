@@ -20,9 +20,11 @@ import typer.main
 
 from zsched.cli import app
 from zsched.config.timing import PROFILES
-from zsched.ipc import pipe as relay_pipe
-from zsched.wire import codec as wire  # the pipe's kinds are registered with the codec when its module is imported
-from zsched.wire.keyspace import Keyspace
+from zsched.core.values import (
+    codec as wire,  # the pipe's kinds are registered with the codec when its module is imported
+)
+from zsched.link.keyspace import Keyspace
+from zsched.link.pipe import frames as relay_pipe
 from zsched_lab.bugs.core_bugs import Bug
 from zsched_lab.bugs.planted import BUGS, places
 
@@ -115,7 +117,7 @@ def test_named_files_exist(name: str) -> None:
 
 
 def test_planted_missing_file_is_found() -> None:
-    assert missing_files("`core/node.py` `tests/unit/core/test_{node,nothing}.py` `core/absent.py`") == [
+    assert missing_files("`core/node/node.py` `tests/unit/core/test_{node,nothing}.py` `core/absent.py`") == [
         "tests/unit/core/test_nothing.py",
         "core/absent.py",
     ]

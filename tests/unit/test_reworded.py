@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from zsched.commands.metrics import metrics_text
-from zsched.commands.report import all_problems
+from zsched.commands.base.report import all_problems
 from zsched.core.values.problems import Problem, of_kind, parted, told_of
-from zsched.doctor.daemon import lacks_of_owners
-from zsched.doctor.fleet import have_true_clocks
+from zsched.tools.doctor.daemon import lacks_of_owners
+from zsched.tools.doctor.fleet import have_true_clocks
+from zsched.tools.metrics import metrics_text
 
 RECORDED = Path(__file__).parent / "commands" / "recorded_status" / "degraded.json"
 SAID = {

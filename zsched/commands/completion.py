@@ -16,10 +16,10 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from zsched import paths as places
-from zsched.adapters.host.operator_client import ask
-from zsched.commands.common import Json
-from zsched.errors import AdapterError, ConfigError
+from zsched.commands.base.common import Json
+from zsched.core.values.errors import AdapterError, ConfigError
+from zsched.host import paths as places
+from zsched.host.operator_client import ask
 
 ANSWER_S: Final = 0.5
 """A daemon that does not answer so soon is not waited for: somebody holds the tab key."""
@@ -85,7 +85,7 @@ def _values(param: Any) -> list[str]:
     if name == "CONDITION":
         return list(CONDITIONS)
     if name == "DANGER":
-        from zsched.commands.apply import DANGERS  # noqa: PLC0415 - only who completes it pays for it
+        from zsched.commands.act.apply import DANGERS  # noqa: PLC0415 - only who completes it pays for it
 
         return list(DANGERS)
     kind = getattr(getattr(param, "type_descriptor", None), "annotation", None)

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from zsched.commands.common import CliError, Verb, Verbs
-from zsched.commands.options import command_of
-from zsched.exits import EXIT_FAILED, EXIT_USAGE
+from zsched.commands.base.common import CliError, Verb, Verbs
+from zsched.commands.base.options import command_of
+from zsched.core.values.exits import EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -29,44 +29,44 @@ if TYPE_CHECKING:
 
 GROUP: Final = "zsched.commands"
 VERBS: Final = {
-    "up": "up",
-    "init": "init",
-    "new": "example",
-    "dev": "dev",
-    "status": "status",
-    "top": "watch.screen",
-    "web": "watch.web",
-    "record": "watch.record",
-    "trace": "watch.trace",
-    "explain": "explain",
-    "history": "history",
-    "events": "history",
-    "move": "move",
-    **dict.fromkeys(("pin", "unpin", "pause", "resume"), "hold"),
-    "tune": "tune",
-    "restart": "restart",
-    **dict.fromkeys(("drain", "undrain"), "flags"),
-    **dict.fromkeys(("invite", "join"), "membership"),
-    "leave": "leave",
-    "rehearse": "rehearse",
-    "doctor": "doctor",
-    "ping": "ping",
-    "bugreport": "bugreport",
-    "wait": "wait",
-    "logs": "logs",
-    "check": "check",
-    "apply": "apply",
-    "edit": "fleet",
-    "version": "versions",
-    **dict.fromkeys(("install", "uninstall"), "install"),
-    "stream": "stream",
-    "fleet": "fleet",
-    **dict.fromkeys(("task", "node"), "entries"),
-    "pki": "pki",
-    "metrics": "metrics",
+    "up": "commands.up",
+    "init": "commands.members.init",
+    "new": "tools.example",
+    "dev": "tools.dev.verb",
+    "status": "commands.look.status",
+    "top": "tools.watch.screen",
+    "web": "tools.watch.web",
+    "record": "tools.watch.record",
+    "trace": "tools.watch.trace",
+    "explain": "commands.look.explain",
+    "history": "commands.look.history",
+    "events": "commands.look.history",
+    "move": "commands.act.move",
+    **dict.fromkeys(("pin", "unpin", "pause", "resume"), "commands.act.hold"),
+    "tune": "commands.act.tune",
+    "restart": "commands.act.restart",
+    **dict.fromkeys(("drain", "undrain"), "commands.act.flags"),
+    **dict.fromkeys(("invite", "join"), "commands.members.membership"),
+    "leave": "commands.members.leave",
+    "rehearse": "tools.rehearsal.verb",
+    "doctor": "tools.doctor.verb",
+    "ping": "commands.look.ping",
+    "bugreport": "tools.bugreport",
+    "wait": "commands.look.wait",
+    "logs": "commands.look.logs",
+    "check": "commands.look.check",
+    "apply": "commands.act.apply",
+    "edit": "commands.act.fleet",
+    "version": "commands.base.versions",
+    **dict.fromkeys(("install", "uninstall"), "tools.install"),
+    "stream": "tools.stream",
+    "fleet": "commands.act.fleet",
+    **dict.fromkeys(("task", "node"), "commands.act.entries"),
+    "pki": "commands.members.pki",
+    "metrics": "tools.metrics",
 }
-"""{verb: the module of `zsched.commands` that has a function, or a group, of its name}, in the order of the help."""
-UNTOLD: Final = {"complete": "completion"}
+"""{verb: the module of `zsched` that has a function, or a group, of its name}, in the order of the help."""
+UNTOLD: Final = {"complete": "commands.completion"}
 """The same, of those that the help leaves out."""
 LAB_VERBS: Final = frozenset({"bench", "demo"})
 """Verbs of the distribution ``zsched-lab``, which a robot has not."""
@@ -104,13 +104,13 @@ def installed_verbs() -> dict[str, EntryPoint]:
 
 @cache
 def _own(name: str) -> Any:
-    module = import_module(f"zsched.commands.{(VERBS | UNTOLD)[name]}")
+    module = import_module(f"zsched.{(VERBS | UNTOLD)[name]}")
     return command_of(name, getattr(module, name))
 
 
 def _told(name: str) -> str:
     """The first sentence of a verb's help, out of its source: to import all of them takes half a second, and zenoh."""
-    spec = find_spec(f"zsched.commands.{VERBS[name]}")
+    spec = find_spec(f"zsched.{VERBS[name]}")
     assert spec is not None
     assert spec.origin is not None
     for node in ast.parse(Path(spec.origin).read_bytes()).body:

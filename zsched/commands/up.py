@@ -13,9 +13,9 @@ from typing import Annotated, Final, NoReturn
 
 import typer
 
-from zsched import paths as places
-from zsched.commands.here import need_file, own_name
-from zsched.commands.options import Machine
+from zsched.commands.base.here import need_file, own_name
+from zsched.commands.base.options import Machine
+from zsched.host import paths as places
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 

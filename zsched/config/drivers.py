@@ -5,15 +5,19 @@ Knows: the keys of each driver, the words of each program (`zsched.drivers`). Do
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping
 from enum import StrEnum
+from pathlib import Path
 from typing import Final
 
 from zsched.config.blocks import Choice, Field, Here, ListOf, Located, Section, Text
 from zsched.config.reader import Collector
 from zsched.core.route.ros2 import name_fault
+from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.plan import ReadyWhen
+from zsched.host.workers.hired import starter_of
 
 
 class Driver(StrEnum):
@@ -149,6 +153,18 @@ def command_of(section: Section, out: Collector) -> tuple[str, ...] | None:
 def runs_as_the_daemon(command: tuple[str, ...]) -> bool:
     """Whether a worker's command is a driver that needs the daemon's rights."""
     return command[:3] in [_program(driver) for driver in AS_THE_DAEMON]
+
+
+def starter_for(worker: WorkerSpec, fleet: Fleet, env: Mapping[str, str] = os.environ) -> Path | None:
+    """Who starts a worker, as another user.
+
+    In a secured fleet, or by an operator's zenoh file, sessions may need a key that only the daemon's user reads: there
+    another user must be asked for. In a secured fleet it then joins by its own relay alone.
+    """
+    may_need_key = fleet.security is not None or fleet.zenoh_config
+    if runs_as_the_daemon(worker.command) or (may_need_key and not worker.user):
+        return None
+    return starter_of(worker.user, env)
 
 
 def _program(driver: Driver) -> tuple[str, ...]:

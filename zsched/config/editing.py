@@ -18,8 +18,8 @@ from typing import Any, Final
 from zsched.config.reader import Mapping, Node, Scalar, read_yaml
 from zsched.config.reader import Sequence as Listing
 from zsched.config.rows import flow
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.struct import Struct, replace
-from zsched.errors import ConfigError
 
 _STEP: Final = 2
 """Indentation of entries where the file shows none."""

@@ -19,14 +19,15 @@ from zsched.config.security import read_security
 from zsched.config.site import read_site
 from zsched.config.tasks import check_secured, read_tasks
 from zsched.config.timing import WIFI, timing_faults
-from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
+from zsched.core.membership.beat_room import most_bytes
+from zsched.core.values.beat import MAX_BEAT_BYTES
 from zsched.core.values.document import MAX_DOCUMENT_BYTES
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import Fleet, Timing
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.struct import Struct
-from zsched.errors import ConfigError
-from zsched.files import owner_of, read_regular
-from zsched.paths import SYSTEM_CONFIG
+from zsched.host.files import owner_of, read_regular
+from zsched.host.paths import SYSTEM_CONFIG
 
 __all__ = ["CheckResult", "Fault", "check_bytes", "check_file", "load_fleet", "require_node"]
 

@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Final, TypeAlias
 
 from zsched.core.values.struct import Struct, field, replace
-from zsched.screen import printable
+from zsched.host.screen import printable
 
 MAX_FILE_BYTES: Final = 256 << 10
 """Three thousand rules and more; each is checked, and an operator waits seconds."""

@@ -1,6 +1,6 @@
 """Decides what the `site:` section of a fleet file says: the other fleets of the site, and at which addresses.
 
-Knows: which addresses can be dialled. Does not know: what is asked there (`zsched.commands.cells`), certificates.
+Knows: which addresses can be dialled. Does not know: what is asked there (`zsched.commands.look.cells`), certificates.
 """
 
 from __future__ import annotations

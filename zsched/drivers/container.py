@@ -21,9 +21,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from zsched.core.values.exits import EXIT_CONFIG
 from zsched.drivers.engine import Ended, Look, ask, begin, said
 from zsched.drivers.place import Place
-from zsched.exits import EXIT_CONFIG
 
 ENGINES: Final = ("podman", "docker")
 """In the order in which they are looked for."""

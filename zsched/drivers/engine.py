@@ -2,7 +2,7 @@
 
 A driver is a worker's process like any other: the daemon starts it, reads what it prints, asks it to end by SIGINT and
 SIGTERM, and takes its end as the worker's. So restarts, limits, logs and reasons are those of
-`zsched.adapters.workers.supervisor`, and the daemon loads nothing of any engine.
+`zsched.host.workers.supervisor`, and the daemon loads nothing of any engine.
 
 Knows: signals, the order of an engine's commands, exit statuses. Does not know: which engine there is, zenoh.
 """
@@ -18,12 +18,12 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
-from zsched.adapters.workers.process import LAUNCHER
+from zsched.core.values.errors import ConfigError
+from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
 from zsched.core.values.struct import Struct
 from zsched.drivers.place import Place
-from zsched.errors import ConfigError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_OK
-from zsched.guard import guarded
+from zsched.host.guard import guarded
+from zsched.host.workers.process import LAUNCHER
 
 COMMAND_S: Final = 10.0
 """An engine that does not answer a command within this time has failed."""

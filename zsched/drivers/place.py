@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.struct import Struct
-from zsched.errors import ConfigError
-from zsched.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, beside_session
+from zsched.host.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, beside_session
 
 TOLD: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
 ALSO: Final = (

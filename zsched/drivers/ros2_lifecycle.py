@@ -20,7 +20,6 @@ from typing import Final
 
 import zenoh
 
-from zsched.clock import awake_s, wall_ns
 from zsched.core.route.lifecycle import (
     GET_STATE_REQUEST,
     State,
@@ -42,15 +41,16 @@ from zsched.core.route.ros2 import (
     name_fault,
     node_name_fault,
 )
+from zsched.core.values.errors import ConfigError
+from zsched.core.values.exits import EXIT_CONFIG
 from zsched.core.values.plan import Role, WorkerRole
 from zsched.drivers.engine import Ended, Look, begin
 from zsched.drivers.place import Place
-from zsched.errors import ConfigError
-from zsched.exits import EXIT_CONFIG
-from zsched.guard import end_with, ends_within, guarded
-from zsched.sessions.closing import CLOSE_S
-from zsched.sessions.config import relay_endpoint
-from zsched.wire.keyspace import Keyspace
+from zsched.host.clock import awake_s, wall_ns
+from zsched.host.guard import end_with, ends_within, guarded
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.closing import CLOSE_S
+from zsched.link.sessions.config import relay_endpoint
 from zsched.worker.roles import RoleWatch
 from zsched.worker.start import open_session
 

@@ -14,11 +14,11 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from zsched.clock import wall_s
+from zsched.core.values.exits import EXIT_CONFIG
 from zsched.drivers.engine import Ended, Look, ask, begin, said
 from zsched.drivers.place import Place
-from zsched.exits import EXIT_CONFIG
-from zsched.paths import ENVIRONMENT_SUFFIX
+from zsched.host.clock import wall_s
+from zsched.host.paths import ENVIRONMENT_SUFFIX
 
 SYSTEMCTL: Final = "systemctl"
 SHOWN: Final = "LoadState,LoadError,ActiveState,Result,ExecMainStatus,ExecMainCode,MainPID,InvocationID,ControlGroup"

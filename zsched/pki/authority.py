@@ -1,7 +1,7 @@
 """The fleet's authority in one folder: its key, its certificate, and the record of what it has issued and revoked.
 
-Knows: the folder's files. Does not know: sessions, which names are let in (`zsched.runtime.access_rules`, by the fleet
-file).
+Knows: the folder's files. Does not know: sessions, which names are let in (`zsched.link.sessions.access_rules`, by the
+fleet file).
 
 ``ca-<number>.key`` is the one secret; with a passphrase it is encrypted. ``authority.json`` is the record, plain text:
 the certificates that nodes trust (two between `rotate` and `finish`), and every key that was certified, with its newest
@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from zsched.core.values.certificates import MAX_KEY, Holder, Role, parse_label
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.struct import Struct, replace
-from zsched.errors import AdapterError
-from zsched.files import read_regular
+from zsched.host.files import read_regular
+from zsched.host.key_files import PRIVATE, PUBLIC, make_folder, open_lock, write_whole
+from zsched.link.sessions.certificate import validities
 from zsched.pki import certificates as x509
-from zsched.pki.files import PRIVATE, PUBLIC, make_folder, open_lock, write_whole
-from zsched.sessions.certificate import validities
 
 TRUSTED, RECORD, LOCK = "ca.pem", "authority.json", ".lock"
 FORMAT: Final = 1
@@ -89,7 +89,7 @@ class Record(Struct, frozen=True, kw_only=True):
     lives: tuple[tuple[str, int], ...] = ()
     """(node, its incarnation when the rotation began), of those that lived; empty: nobody has looked."""
     creation: str = ""
-    """Of the fleet for which it was made (`zsched.runtime.unfinished`); empty: it was made by itself."""
+    """Of the fleet for which it was made (`zsched.commands.members.unfinished`); empty: it was made by itself."""
 
     def entry(self, label: str) -> Entry | None:
         """The entry of a label; ``None``: no key of that label was certified."""

@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsched.core.values.certificates import MAX_COMMON_NAME, Holder
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.struct import Struct
-from zsched.errors import AdapterError
 
 AUTHORITY_LIFE: Final = timedelta(days=3650)
 LIFE: Final = timedelta(days=30)

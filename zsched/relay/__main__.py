@@ -15,12 +15,12 @@ import signal
 from pathlib import Path
 from typing import Final
 
-from zsched.exits import EXIT_FAILED, EXIT_OK
-from zsched.guard import end_with
-from zsched.heap import share_heaps
-from zsched.log_limit import log_to_stderr
+from zsched.core.values.exits import EXIT_FAILED, EXIT_OK
+from zsched.host.guard import end_with
+from zsched.host.heap import share_heaps
+from zsched.host.log_limit import log_to_stderr
+from zsched.link.sessions.config import relay_pools
 from zsched.relay.visits import RefusedError, Visits
-from zsched.sessions.config import relay_pools
 
 ALONE_S: Final = 60.0
 """How long streams run on without a daemon: it begins anew within this time, however slow the machine is."""

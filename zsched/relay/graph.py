@@ -22,7 +22,7 @@ from zsched.core.route.ros_mirror import Sides, mirrored
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import RosGraph, Route
 from zsched.core.values.struct import Struct, field
-from zsched.guard import guarded, tolerant
+from zsched.host.guard import guarded, tolerant
 from zsched.relay.streams.receive import undeclare
 
 MAX_TOKENS: Final = 20_000

@@ -16,10 +16,10 @@ from typing import Final
 
 import zenoh
 
-from zsched.core.events import ProblemReported
-from zsched.core.relay_protocol import RelayReport
-from zsched.guard import guarded
-from zsched.sessions.problems import why_not_open
+from zsched.core.values.events import ProblemReported
+from zsched.core.values.relay_protocol import RelayReport
+from zsched.host.guard import guarded
+from zsched.link.sessions.problems import why_not_open
 
 RETRY_S: Final = 0.5
 SOURCE: Final = "relay/local"

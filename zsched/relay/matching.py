@@ -20,13 +20,13 @@ from typing import Any, Final
 import zenoh
 from zenoh import Locality, Session
 
-from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.model import TaskId
+from zsched.core.values.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.struct import Struct, field
-from zsched.guard import guarded, tolerant
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded, tolerant
+from zsched.link.sessions.matching import is_matched
 from zsched.relay.streams.receive import Declared, undeclare
-from zsched.sessions.matching import is_matched
 
 SETTLE_S: Final = 1.5
 """A relay that has just started has no links yet: for this long it does not say that nobody is there."""

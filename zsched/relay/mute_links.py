@@ -20,10 +20,10 @@ from zenoh import Sample, SampleKind, Session, ZError
 
 from zsched.core.membership.relink import Introductions
 from zsched.core.values.model import NodeId
-from zsched.guard import tolerant
+from zsched.host.guard import tolerant
+from zsched.link.keyspace import Keyspace, parse
+from zsched.link.sessions.link_sockets import LinkSocket, LinkSockets
 from zsched.relay.tokens import MAX_OF_NODE
-from zsched.sessions.link_sockets import LinkSocket, LinkSockets
-from zsched.wire.keyspace import Keyspace, parse
 
 QUIET_BYTES: Final = 200
 """Each way between two looks, a second apart: signs of life, also within TLS, are fewer."""

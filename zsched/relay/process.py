@@ -24,18 +24,26 @@ from typing import Final
 
 import zenoh
 
-from zsched.clock import awake_s, monotonic_s
-from zsched.core.events import FrameDropped, ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.membership.relink import Introductions
-from zsched.core.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
+from zsched.core.values import codec as wire
 from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.errors import WireError
+from zsched.core.values.events import FrameDropped, ProblemReported, RoleEnded, StreamsCounted
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import Role, Route, RoutePlan
-from zsched.errors import WireError
-from zsched.guard import calmed, ends_within, guarded, on_failure
-from zsched.heap import Leftovers
-from zsched.ipc.pipe import COMMANDS, write_frame
-from zsched.ipc.protocol import RelayPulse
+from zsched.core.values.relay_protocol import RelayReport, RelayStarted, RelayStop, TaskEnded, WorkerSeen, WorkerWatch
+from zsched.host.clock import awake_s, monotonic_s
+from zsched.host.guard import calmed, ends_within, guarded, on_failure
+from zsched.host.heap import Leftovers
+from zsched.link.keyspace import Keyspace
+from zsched.link.pipe.frames import COMMANDS, write_frame
+from zsched.link.pipe.protocol import RelayPulse
+from zsched.link.sessions.closing import ALARM_S, CLOSE_S
+from zsched.link.sessions.config import WORKERS_BY, lease_s, setting
+from zsched.link.sessions.expulsion import MAX_DATA_SESSIONS, Expulsion, Refusal, members_of
+from zsched.link.sessions.link_sockets import opened
+from zsched.link.sessions.problems import why_not_open
+from zsched.link.sessions.relink import Introducer
 from zsched.relay.graph import GraphMirror
 from zsched.relay.local_side import LocalSide
 from zsched.relay.matching import Matching
@@ -47,14 +55,6 @@ from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
 from zsched.relay.troubles import Troubles
 from zsched.relay.visits import Daemon, RefusedError, Visits
-from zsched.sessions.closing import ALARM_S, CLOSE_S
-from zsched.sessions.config import WORKERS_BY, lease_s, setting
-from zsched.sessions.expulsion import MAX_DATA_SESSIONS, Expulsion, Refusal, members_of
-from zsched.sessions.link_sockets import opened
-from zsched.sessions.problems import why_not_open
-from zsched.sessions.relink import Introducer
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 
 COUNT_S: Final = 1.0
 """Period of the counters."""

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from zenoh import CongestionControl, Priority, Query, Session
 
+from zsched.core.values import codec as wire
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.guard import tolerant
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.host.guard import tolerant
+from zsched.link.keyspace import Keyspace
 
 
 class RoleServer:

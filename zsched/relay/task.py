@@ -16,9 +16,7 @@ from typing import Final
 import zenoh
 from zenoh import Session, Timestamp
 
-from zsched.clock import monotonic_s
-from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import RelayReport, SlotLost
+from zsched.core.values.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import (
     Direction,
@@ -32,8 +30,10 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamCount,
 )
+from zsched.core.values.relay_protocol import RelayReport, SlotLost
 from zsched.core.values.struct import Struct
-from zsched.guard import guarded
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded
 from zsched.relay.graph import GraphMirror
 from zsched.relay.open_streams import OpenStreams
 from zsched.relay.orders import Ended, Finish, Leave, Orphaned, Rejoin, Unowned

@@ -14,11 +14,11 @@ from functools import partial
 
 from zenoh import Sample, SampleKind, Session
 
-from zsched.core.events import RoleEnded
-from zsched.core.relay_protocol import WorkerSeen
+from zsched.core.values.events import RoleEnded
 from zsched.core.values.model import NodeId, TaskId
-from zsched.guard import tolerant
-from zsched.wire.keyspace import Keyspace, counter, parse
+from zsched.core.values.relay_protocol import WorkerSeen
+from zsched.host.guard import tolerant
+from zsched.link.keyspace import Keyspace, counter, parse
 
 MAX_TOKENS = 16_384
 """Tokens that are remembered: a fleet has one or two per worker."""

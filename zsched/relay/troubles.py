@@ -10,14 +10,14 @@ from typing import Final
 
 from zenoh import Sample, Session
 
-from zsched.clock import monotonic_s
-from zsched.core.events import FrameDropped, WorkerJobs
-from zsched.core.relay_protocol import WorkerTrouble
+from zsched.core.values.errors import WireError
+from zsched.core.values.events import FrameDropped, WorkerJobs
 from zsched.core.values.model import NodeId
-from zsched.errors import WireError
-from zsched.guard import tolerant
-from zsched.ipc.pipe import decode_word
-from zsched.wire.keyspace import Keyspace, parse
+from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import tolerant
+from zsched.link.keyspace import Keyspace, parse
+from zsched.link.pipe.frames import decode_word
 
 PAUSE_S: Final = 0.1
 """A worker says something five times a second; more than this is no worker of ours, and is left out."""

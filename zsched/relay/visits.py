@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from zsched import __version__
-from zsched.clock import awake_s
+from zsched.core.values import codec as wire
+from zsched.core.values.errors import WireError
 from zsched.core.values.struct import Struct
-from zsched.errors import WireError
-from zsched.ipc.pipe import read_frame, set_timeout, write_frame
-from zsched.ipc.protocol import RelayHello, RelayHere, RelayQuestion, RelayRefused
-from zsched.ipc.relay_socket import PROTOCOL
-from zsched.wire import codec as wire
+from zsched.host.clock import awake_s
+from zsched.link.pipe.frames import read_frame, set_timeout, write_frame
+from zsched.link.pipe.protocol import RelayHello, RelayHere, RelayQuestion, RelayRefused
+from zsched.link.pipe.relay_socket import PROTOCOL
 
 HELLO_S: Final = 0.5
 LOOK_S: Final = 1.0

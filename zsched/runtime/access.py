@@ -13,8 +13,8 @@ from typing import Any
 from zsched.core.values.fleet import LocalSide, NodeSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
-from zsched.runtime.own_addresses import dialled_here
-from zsched.sessions import config as zenoh_config
+from zsched.link.sessions import config as zenoh_config
+from zsched.link.sessions.own_addresses import dialled_here
 
 Json = dict[str, Any]
 

@@ -1,7 +1,7 @@
 """Lets a running daemon's adapters follow another fleet file; what they cannot follow is reported.
 
 Knows: which adapter is made from which part of the file. Does not know: what the node makes of it
-(`zsched.core.handlers.fleet`).
+(`zsched.core.node.fleet`).
 """
 
 from __future__ import annotations
@@ -9,25 +9,25 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.limits import limit_for
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.adapters.workers.supervisor import WorkerSupervisor
-from zsched.core import events as ev
-from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import watch_for
+from zsched.core.values import events as ev
 from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.relay_protocol import WorkerWatch
 from zsched.core.values.struct import Struct, field
-from zsched.runtime.access_rules import names_of
+from zsched.host.workers.supervisor import WorkerSupervisor
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.bus.limits import limit_for
+from zsched.link.sessions.access_rules import names_of
+from zsched.link.sessions.endpoints import Endpoints, endpoints_for
+from zsched.link.sessions.restarts import moved, opens_anew, restarts, waits_for
+from zsched.link.sessions.sealing import orderers_of
 from zsched.runtime.crew import Crew
-from zsched.runtime.endpoints import Endpoints, endpoints_for
 from zsched.runtime.recipes import Recipes
-from zsched.runtime.restarts import moved, opens_anew, restarts, waits_for
+from zsched.runtime.relay.streams import RelayHandle
 from zsched.runtime.sampler import Sampler
-from zsched.runtime.sealing import orderers_of
 
 SOURCE = "restart"
 """Of the problem that says what a restart is needed for."""

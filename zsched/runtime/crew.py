@@ -13,18 +13,18 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
-from zsched.adapters.workers.supervisor import WorkerSupervisor
-from zsched.clock import monotonic_s, wall_time
-from zsched.core import events as ev
-from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet, TaskSpec
 from zsched.core.values.model import MAX_REASON, NodeId, TaskId
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.profile import WorkerState
+from zsched.core.values.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.values.words import Trouble
-from zsched.guard import guarded
+from zsched.host.clock import monotonic_s, wall_time
+from zsched.host.guard import guarded
+from zsched.host.workers.supervisor import WorkerSupervisor
+from zsched.link.keyspace import Keyspace, counter
 from zsched.runtime.sessions import SessionsRead
-from zsched.wire.keyspace import Keyspace, counter
 
 OTHERS: Final = (
     "somebody takes every node's inputs (a recorder?): whether a worker is there cannot be told by matching; "

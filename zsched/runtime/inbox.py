@@ -9,7 +9,7 @@ import queue
 from collections import deque
 from collections.abc import Iterator
 
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 
 INBOX_LIMIT = 20_000
 WAITING_LIMIT = 64

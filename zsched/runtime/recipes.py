@@ -1,7 +1,7 @@
 """Decides what this node's workers are made with: commands, environments, and the sessions that they open.
 
 Knows: the fleet file's workers, their session files in the runtime folder. Does not know: processes
-(`zsched.adapters.workers.supervisor`), when a worker is started again.
+(`zsched.host.workers.supervisor`), when a worker is started again.
 """
 
 from __future__ import annotations
@@ -13,17 +13,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from zsched.adapters.workers.hired import starter_of
-from zsched.config.drivers import runs_as_the_daemon
+from zsched.config.drivers import starter_for
 from zsched.core.route.route import outputs_of
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerLink, WorkerSpec, runs_worker
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.struct import Struct
-from zsched.errors import AdapterError
-from zsched.files import write_regular
-from zsched.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, SESSION_SUFFIX, beside_session
+from zsched.host.files import write_regular
+from zsched.host.paths import ENVIRONMENT_SUFFIX, PID_SUFFIX, SESSION_SUFFIX, beside_session
+from zsched.link.sessions import config as zenoh_config
 from zsched.runtime.sessions import SessionsRead
-from zsched.sessions import config as zenoh_config
 
 NOTHING: Final[Mapping[str, str]] = {}
 
@@ -169,15 +168,3 @@ class Recipes:
         if keys := outputs_of(task, self._me):
             made |= {"ZSCHED_OUTPUT_KEYS": json.dumps(keys)}
         return made
-
-
-def starter_for(worker: WorkerSpec, fleet: Fleet, env: Mapping[str, str] = os.environ) -> Path | None:
-    """Who starts a worker, as another user.
-
-    In a secured fleet, or by an operator's zenoh file, sessions may need a key that only the daemon's user reads: there
-    another user must be asked for. In a secured fleet it then joins by its own relay alone.
-    """
-    may_need_key = fleet.security is not None or fleet.zenoh_config
-    if runs_as_the_daemon(worker.command) or (may_need_key and not worker.user):
-        return None
-    return starter_of(worker.user, env)

@@ -1,6 +1,6 @@
 """Reads the fleet file again when an operator asks for it (SIGHUP, `systemctl reload zsched`).
 
-Knows: where the file is. Does not know: what a changed file leads to (`zsched.core.handlers.fleet`).
+Knows: where the file is. Does not know: what a changed file leads to (`zsched.core.node.fleet`).
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from zsched.config.load import load_fleet, require_node
-from zsched.core import events as ev
+from zsched.core.values import events as ev
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import NodeId
-from zsched.errors import ConfigError
-from zsched.guard import guarded
+from zsched.host.guard import guarded
 
 SOURCE = "reload"
 """Of the problem that the file is wrong."""

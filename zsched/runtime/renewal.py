@@ -1,7 +1,7 @@
 """Takes a newer certificate for this node's key, which the holder of the fleet's authority has sent.
 
 Knows: what must stand in it, where it is kept. Does not know: its sender; the authority's signature counts, and
-nothing else; how it comes (`zsched.adapters.network.control_bus`), when sessions go by it (`zsched.daemon`).
+nothing else; how it comes (`zsched.link.bus.control_bus`), when sessions go by it (`zsched.daemon`).
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from zsched.clock import wall_ns
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.errors import ConfigError
-from zsched.pki.files import PUBLIC, make_folder, write_whole
-from zsched.runtime.secured import CERTIFICATE, authority_rank, bytes_of, files_of, identity_of, renewed_in
-from zsched.sessions.certificate import ders_of, parts_of, pem_of
+from zsched.host.clock import wall_ns
+from zsched.host.key_files import PUBLIC, make_folder, write_whole
+from zsched.link.sessions.certificate import ders_of, parts_of, pem_of
+from zsched.link.sessions.secured import CERTIFICATE, authority_rank, bytes_of, files_of, identity_of, renewed_in
 
 SOON: Final = timedelta(days=7)
 """This long before its certificate ends a node says so: it is due since 3 days then, and nobody has renewed it."""
@@ -40,7 +40,7 @@ def take(fleet: Fleet, state: Path, pem: str) -> CommandResult:
     """
     if fleet.security is None:
         return _refused("this node's fleet has no certificates")
-    from zsched.pki.signatures import Trust  # noqa: PLC0415 - it takes 8 MiB: only where there are certificates
+    from zsched.link.signatures import Trust  # noqa: PLC0415 - it takes 8 MiB: only where there are certificates
 
     files = files_of(fleet.security)
     try:

@@ -9,15 +9,15 @@ import logging
 import secrets
 from pathlib import Path
 
-from zsched.adapters.host.state_file import LoadResult, StateFile
-from zsched.clock import wall_tenths
 from zsched.core.electorate.numbers import in_force
 from zsched.core.values.document import Flag
 from zsched.core.values.durable import DurableState
+from zsched.core.values.errors import AdapterError, ConfigError
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import NodeId
 from zsched.core.values.struct import Struct, field, replace
-from zsched.errors import AdapterError, ConfigError
+from zsched.host.clock import wall_tenths
+from zsched.host.state_file import LoadResult, StateFile
 from zsched.runtime.library import Library
 
 log = logging.getLogger("zsched.daemon")

@@ -10,18 +10,18 @@ import math
 import threading
 from pathlib import Path
 
-from zsched.adapters.machine import core_speed
-from zsched.adapters.machine.device_profiler import RESTING_LOOK_S, DeviceProfiler
-from zsched.adapters.machine.gauges import GaugeWatch
-from zsched.adapters.radio.network_profiler import readers_for
-from zsched.clock import ClockWatch, monotonic_s
-from zsched.core import events as ev
 from zsched.core.profile.sampling import Sampling
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import NodeSpec
 from zsched.core.values.struct import replace
 from zsched.core.vote.clocks import is_bad
-from zsched.guard import guarded
-from zsched.paths import PID_SUFFIX, beside_session
+from zsched.host.clock import ClockWatch, monotonic_s
+from zsched.host.guard import guarded
+from zsched.host.machine import core_speed
+from zsched.host.machine.device_profiler import RESTING_LOOK_S, DeviceProfiler
+from zsched.host.machine.gauges import GaugeWatch
+from zsched.host.paths import PID_SUFFIX, beside_session
+from zsched.host.radio.network_profiler import readers_for
 from zsched.runtime.inbox import Inbox
 from zsched.runtime.shell import Shell
 

@@ -14,21 +14,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 from zsched.config.load import load_fleet, require_node
-from zsched.core import events as ev
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId
 from zsched.core.values.problems import Problem
-from zsched.errors import ConfigError
+from zsched.link.sessions import tls as daemon_tls
+from zsched.link.sessions.access_rules import Side
+from zsched.link.sessions.endpoints import Endpoints, is_here
+from zsched.link.sessions.roaming import Roaming, addresses_towards, gone_from, numeric, places_of
+from zsched.link.sessions.sealing import seals_of
+from zsched.link.sessions.secured import digest_of, require_own
 from zsched.runtime import renewal
-from zsched.runtime import tls as daemon_tls
-from zsched.runtime.access_rules import Side
-from zsched.runtime.endpoints import Endpoints, is_here
 from zsched.runtime.reopening import Moved, Reopening, first_wait_s, turns
-from zsched.runtime.roaming import Roaming, addresses_towards, gone_from, numeric, places_of
-from zsched.runtime.sealing import seals_of
-from zsched.runtime.secured import digest_of, require_own
 
 LOOK_S = 30.0
 """How often the certificate's files are looked at."""

@@ -17,8 +17,8 @@ from typing import Final
 
 from zsched.core.values.model import TaskId
 from zsched.core.values.struct import Struct
-from zsched.files import read_regular, write_regular
-from zsched.sessions.comparison import lacking
+from zsched.host.files import read_regular, write_regular
+from zsched.host.workers.comparison import lacking
 
 NAME: Final = "sessions.json"
 MAX_BYTES: Final = 4 << 20

@@ -14,25 +14,10 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import assert_never
 
-from zsched.adapters.host.decision_log import DecisionLog
-from zsched.adapters.host.rehearsals import RehearsalStore
-from zsched.adapters.host.state_file import StateFile
-from zsched.adapters.network.address_trial import AddressTrial
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.adapters.workers.supervisor import WorkerSupervisor
-from zsched.clock import monotonic_s
-from zsched.core import events as ev
-from zsched.core import instructions as do
-from zsched.core.relay_protocol import (
-    HandleReport,
-    RelayStarted,
-    SlotLost,
-    WorkerMatched,
-    WorkerSeen,
-    WorkerTrouble,
-)
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.document import Text
+from zsched.core.values.errors import AdapterError, WireError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import (
     CommandOutcome,
@@ -44,13 +29,28 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.rehearsal import KeepRehearsal, RehearsalsTold
+from zsched.core.values.relay_protocol import (
+    HandleReport,
+    RelayStarted,
+    SlotLost,
+    WorkerMatched,
+    WorkerSeen,
+    WorkerTrouble,
+)
 from zsched.core.values.struct import replace
 from zsched.core.values.words import shown
-from zsched.errors import AdapterError, WireError
+from zsched.host.clock import monotonic_s
+from zsched.host.decision_log import DecisionLog
+from zsched.host.rehearsals import RehearsalStore
+from zsched.host.state_file import StateFile
+from zsched.host.workers.supervisor import WorkerSupervisor
+from zsched.link.bus.address_trial import AddressTrial
+from zsched.link.bus.control_bus import ControlBus
 from zsched.runtime.crew import Crew
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk
 from zsched.runtime.inbox import Inbox
 from zsched.runtime.library import Library
+from zsched.runtime.relay.streams import RelayHandle
 from zsched.runtime.strikes import Strikes
 
 FOLLOW_AGAIN_S = 10.0

@@ -1,7 +1,7 @@
 """Does to this daemon what an operator rehearses: ends it, or cuts its links for a while; or says why it cannot.
 
 Knows: what would start this daemon again, nftables. Does not know: whether the fleet can bear it
-(`zsched.core.handlers.rehearsal`).
+(`zsched.core.node.rehearsal`).
 
 The kernel ends a cut: the rules drop what goes to or comes from the ports of a set, and the ports leave the set by a
 timeout of nftables. So a cut is over in time though this daemon, or the one that gave the order, dies meanwhile. What
@@ -24,8 +24,8 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import NodeId
 from zsched.core.values.rehearsal import Step, Strike
-from zsched.guard import guarded
-from zsched.runtime.endpoints import is_here
+from zsched.host.guard import guarded
+from zsched.link.sessions.endpoints import is_here
 
 RESTARTED_BY: Final = "ZSCHED_RESTARTED_BY"
 """Set by a supervisor other than systemd that starts its daemon again, whatever it died of: its name."""

@@ -22,8 +22,8 @@ import argparse
 import sys
 import time
 
-from zsched.errors import ConfigError
-from zsched.exits import EXIT_CONFIG
+from zsched.core.values.errors import ConfigError
+from zsched.core.values.exits import EXIT_CONFIG
 from zsched.worker import Answer, Output, Received, Request, Worker
 
 

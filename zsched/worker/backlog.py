@@ -26,7 +26,7 @@ from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 import zenoh
 
 from zsched.core.hop.receiver import SourceName
-from zsched.hop.weight import weight
+from zsched.link.weight import weight
 from zsched.worker.keep import Held
 
 MAX_WITHHELD: Final = 256

@@ -10,7 +10,7 @@ import queue
 import threading
 from collections.abc import Callable
 
-from zsched.guard import guarded
+from zsched.host.guard import guarded
 
 _log = logging.getLogger("zsched.worker")
 

@@ -22,11 +22,11 @@ from typing import Final
 
 import zenoh
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.guard import call_plain, guarded
-from zsched.hop.acknowledger import Acknowledger
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import call_plain, guarded
+from zsched.link.acknowledger import Acknowledger
 from zsched.worker.backlog import Done, StandbyInputs
 from zsched.worker.jobs import JobBook
 from zsched.worker.keep import Debts, Held, KeptLane

@@ -18,10 +18,10 @@ from time import monotonic, process_time, thread_time
 from types import TracebackType
 from typing import Final, Self
 
-from zsched.core.events import WorkerJobs
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.struct import Struct, replace
-from zsched.guard import guarded
-from zsched.procfs import parse_schedstat, read_file
+from zsched.host.guard import guarded
+from zsched.host.procfs import parse_schedstat, read_file
 
 TELL_S: Final = 0.2
 """Shortest time between two reports to the node: it measures itself as often."""

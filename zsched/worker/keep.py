@@ -2,7 +2,7 @@
 
 Knows: frames of acknowledgements, how answers are put again, which lock guards what. Does not know: epochs, roles, what
 is in an answer, which relay is owed what (`zsched.core.hop.shared`), which input waits for which answers
-(`zsched.core.hop.held`), how an input is acknowledged (`zsched.hop.acknowledger`).
+(`zsched.core.hop.held`), how an input is acknowledged (`zsched.link.acknowledger`).
 
 A link that closes (a freeze, a cut) takes with it what was on it, and a put says nothing about that. So every answer of
 class ``reliable`` is kept, at most ``limit`` of an output and `SHARED_BYTES`, of ``latest`` the newest. A relay that
@@ -32,26 +32,26 @@ from typing import Any, Final
 import zenoh
 from zenoh import CongestionControl, Sample, Session
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.held import Held as HeldOf
 from zsched.core.hop.held import HeldInputs
 from zsched.core.hop.kept import Owed
 from zsched.core.hop.receiver import SourceName
 from zsched.core.hop.serial import serial_of
 from zsched.core.hop.shared import MAX_RECEIVERS, TICK_S, SharedSender, spoken_for
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
+from zsched.core.values import codec as wire
+from zsched.core.values.errors import WireError
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
 from zsched.core.values.struct import Struct, field
-from zsched.errors import WireError
-from zsched.guard import guarded, tolerant
-from zsched.hop.acknowledger import Acknowledger
-from zsched.ipc.pipe import encode_end
-from zsched.sessions.matching import is_matched
-from zsched.sessions.stalled_links import StalledLinks
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, parse
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded, tolerant
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import AGAIN_CHUNK, END_CHUNK, parse
+from zsched.link.pipe.frames import encode_end
+from zsched.link.sessions.matching import is_matched
+from zsched.link.sessions.stalled_links import StalledLinks
 
 MAX_FRAME_BYTES: Final = 1 << 17
-"""Of one frame of acknowledgements: ours have at most `zsched.hop.acknowledger.MAX_PER_FRAME`, and take less."""
+"""Of one frame of acknowledgements: ours have at most `zsched.link.acknowledger.MAX_PER_FRAME`, and take less."""
 MAX_FRAMES: Final = 256
 """Frames that wait for the thread."""
 

@@ -10,8 +10,8 @@ from typing import Final
 
 from zsched.core.route import keyexpr
 from zsched.core.route.route import placeholders
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import MAX_REASON
-from zsched.errors import ConfigError
 
 OUTPUT_KEYS: Final = "ZSCHED_OUTPUT_KEYS"
 """The variable with the key expressions of the task's output rules on this node, a JSON list."""

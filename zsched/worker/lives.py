@@ -14,8 +14,8 @@ from typing import Final
 from zenoh import Sample, SampleKind, Session
 
 from zsched.core.values.model import NodeId
-from zsched.guard import tolerant
-from zsched.wire.keyspace import Keyspace, parse
+from zsched.host.guard import tolerant
+from zsched.link.keyspace import Keyspace, parse
 
 MAX_LIVES: Final = 4096
 """Lives that are remembered: a node has one at a time, and those before it count only until the next move."""

@@ -14,11 +14,11 @@ import zenoh
 from zenoh import CongestionControl, ext
 
 from zsched.core.hop.serial import serial_of
-from zsched.core.relay_protocol import EndMarker
+from zsched.core.values.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct
-from zsched.hop.weight import weight_of
-from zsched.sessions.puts import Payload, PutArguments, put_arguments
-from zsched.sessions.send_queue import SendQueue
+from zsched.link.sessions.puts import Payload, PutArguments, put_arguments
+from zsched.link.sessions.send_queue import SendQueue
+from zsched.link.weight import weight_of
 from zsched.worker.keep import Keeper, KeptLane, put_end
 
 LATEST_DEPTH: Final = 16

@@ -12,11 +12,11 @@ from typing import Final
 
 import zenoh
 
+from zsched.core.values import codec as wire
 from zsched.core.values.endpoint import Endpoint
+from zsched.core.values.errors import WireError
 from zsched.core.values.plan import Role
-from zsched.errors import WireError
-from zsched.guard import guarded, tolerant
-from zsched.wire import codec as wire
+from zsched.host.guard import guarded, tolerant
 
 ROLE_RETRY_S: Final = 0.5
 RETRY_S: Final = 0.02

@@ -14,7 +14,7 @@ from typing import Final, Literal
 import zenoh
 
 from zsched.core.hop.receiver import SourceName
-from zsched.core.relay_protocol import EndMarker
+from zsched.core.values.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct, field
 from zsched.worker.backlog import Done
 

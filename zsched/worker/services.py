@@ -18,11 +18,11 @@ from typing import Final
 
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.core.route.keyexpr import is_wild
+from zsched.core.values.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING
 from zsched.core.values.struct import Struct
-from zsched.guard import guarded, tolerant
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded, tolerant
 from zsched.worker.jobs import JobBook
 from zsched.worker.troubles import Troubles
 

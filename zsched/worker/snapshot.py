@@ -24,15 +24,15 @@ from typing import Final, Protocol
 
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import ERROR_ENCODING, SnapshotChunk
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import Role, WorkerRole
+from zsched.core.values.relay_protocol import ERROR_ENCODING, SnapshotChunk
 from zsched.core.values.struct import Struct
-from zsched.guard import call_plain, guarded, tolerant
-from zsched.ipc.pipe import decode_chunk, encode_chunk
-from zsched.sessions.config import on_top_of, relay_endpoint, setting
-from zsched.wire.keyspace import counter
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import call_plain, guarded, tolerant
+from zsched.link.keyspace import counter
+from zsched.link.pipe.frames import decode_chunk, encode_chunk
+from zsched.link.sessions.config import on_top_of, relay_endpoint, setting
 from zsched.worker.troubles import Troubles
 
 CHUNK: Final = 256 * 1024

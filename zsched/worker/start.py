@@ -14,8 +14,8 @@ from typing import Final
 
 import zenoh
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.struct import Struct
-from zsched.errors import ConfigError
 from zsched.worker.keys import OUTPUT_KEYS, output_keys
 
 _ENVIRONMENT: Final = ("ZSCHED_FLEET", "ZSCHED_NODE", "ZSCHED_TASK", "ZSCHED_INCARNATION", "ZSCHED_ZENOH_CONFIG")
@@ -25,7 +25,7 @@ _ASKED_NODE: Final = "ZSCHED_NODE"
 DEADLINE: Final = "ZSCHED_DEADLINE_MS"
 
 AGAIN_S: Final = 0.2
-"""A client's pause between two tries to reach its relay; a try takes up to `zsched.sessions.config.RELAY_START_S`."""
+"""A client pauses for this long between two tries; a try takes up to `zsched.link.sessions.config.RELAY_START_S`."""
 
 _log = logging.getLogger("zsched.worker")
 

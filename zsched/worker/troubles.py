@@ -17,9 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from zsched.clock import monotonic_s
 from zsched.core.values.model import MAX_REASON
-from zsched.guard import guarded
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded
 
 TELL_S: Final = 1.0
 """Shortest time between two reports to the node."""

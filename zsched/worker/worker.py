@@ -33,23 +33,23 @@ from typing import Any, Final, Self
 
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.core.events import WorkerJobs
 from zsched.core.hop.shared import STALLED_S
-from zsched.core.relay_protocol import StreamAcks, WorkerTrouble
 from zsched.core.route.keyexpr import fault, intersects
+from zsched.core.values import codec as wire
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.model import as_reason
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.guard import ends_within, guarded, tolerant
-from zsched.hop.acknowledger import Acknowledger
-from zsched.ipc.pipe import decode_end
-from zsched.latch import Latch
-from zsched.log_limit import limit_library
-from zsched.sessions.closing import ALARM_S, CLOSE_S
-from zsched.sessions.config import lease_s, relay_endpoint
-from zsched.sessions.stalled_links import StalledLinks
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK, Keyspace
+from zsched.core.values.relay_protocol import StreamAcks, WorkerTrouble
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import ends_within, guarded, tolerant
+from zsched.host.latch import Latch
+from zsched.host.log_limit import limit_library
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import END_CHUNK, Keyspace
+from zsched.link.pipe.frames import decode_end
+from zsched.link.sessions.closing import ALARM_S, CLOSE_S
+from zsched.link.sessions.config import lease_s, relay_endpoint
+from zsched.link.sessions.stalled_links import StalledLinks
 from zsched.worker.epochs import CARRY_LOOK_S, CARRY_S, Epochs, lets_out
 from zsched.worker.errands import Errands
 from zsched.worker.inputs import Dispatcher

@@ -12,7 +12,7 @@ AGREEMENT, LEASE = "zsched.core.vote.agreement", "zsched.core.vote.lease"
 RENEWING, RETUNING = "zsched.core.executor.renewing", "zsched.core.vote.retuning"
 ADOPTION, HANDOVER = "zsched.core.values.adoption", "zsched.core.executor.handover"
 
-_FLEET = ("tests/unit/core/handlers/test_fleet.py",)
+_FLEET = ("tests/unit/core/node/test_fleet.py",)
 _CHANGES = ("tests/sim/test_fleet_changes.py",)
 _RENEWING = ("tests/unit/core/executor/test_renewing.py",)
 

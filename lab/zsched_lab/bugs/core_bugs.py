@@ -38,18 +38,18 @@ class Bug:
         return (self,) if self.also is None else (self, *self.also.parts)
 
 
-CHANGE, BEATS = "zsched.core.values.change", "zsched.core.handlers.beats"
-SEQUENCE, IDENTITY = "zsched.core.sequence", "zsched.core.membership.identity"
+CHANGE, BEATS = "zsched.core.values.change", "zsched.core.node.beats"
+SEQUENCE, IDENTITY = "zsched.core.values.sequence", "zsched.core.membership.identity"
 REGISTER, LEASE, TENURE = "zsched.core.register.register", "zsched.core.vote.lease", "zsched.core.executor.tenure"
 HOLD = "zsched.core.values.lease"
 SEALING, WITNESS = "zsched.core.executor.sealing", "zsched.core.vote.witness"
 NAMESAKES = "zsched.core.membership.namesakes"
 BELIEF = "zsched.core.vote.belief"
 AGREEMENT, ACCEPTOR = "zsched.core.vote.agreement", "zsched.core.vote.acceptor"
-MEMBERSHIP, NODE = "zsched.core.membership.peers", "zsched.core.node"
+MEMBERSHIP, NODE = "zsched.core.membership.peers", "zsched.core.node.node"
 VOTE, VOTING = "zsched.core.vote.tally", "zsched.core.vote.voting"
 DECISION, ROUNDS = "zsched.core.scheduler.decision", "zsched.core.scheduler.rounds"
-ORDERS, EXPIRY = "zsched.core.handlers.orders", "zsched.core.vote.expiry"
+ORDERS, EXPIRY = "zsched.core.node.orders", "zsched.core.vote.expiry"
 SCHEDULER, SCORING, USAGE, STANDING, EXECUTOR = (
     "zsched.core.scheduler.judge",
     "zsched.core.scheduler.scoring",
@@ -82,7 +82,7 @@ _MEMBERSHIP = (
     "tests/unit/core/membership/test_peers.py",
     "tests/sim/test_simulator.py",
 )
-_NODE = ("tests/unit/core/test_node.py",)
+_NODE = ("tests/unit/core/node/test_node.py",)
 _ROUNDS = (
     "tests/sim/test_vote_rules.py",
     "tests/unit/core/scheduler/test_rounds.py",
@@ -93,7 +93,7 @@ _BOOKINGS = ("tests/unit/core/scheduler/test_bookings.py",)
 _JOB_NEED = ("tests/unit/core/gateway/test_job_need.py",)
 _ORPHANS = ("tests/unit/core/scheduler/test_rounds.py",)
 _EXECUTOR = ("tests/unit/core/executor/test_handover.py",)
-_ORDERS = ("tests/unit/core/handlers/test_orders.py",)
+_ORDERS = ("tests/unit/core/node/test_orders.py",)
 _EXPIRY = ("tests/unit/core/vote/test_expiry.py",)
 
 
@@ -442,7 +442,7 @@ LEASE_BUGS = (
     ),
     _bug(
         "the number of an agreed document is taken for other leases",
-        "zsched.core.stages",
+        "zsched.core.node.stages",
         "lambda: leases.terms)",
         "lambda at_first=leases.terms: at_first)",
         _DOCUMENTS,
@@ -474,7 +474,7 @@ LEASE_BUGS = (
         "zsched.core.vote.generations",
         "lease_s=0.0 if before is None else before.lease_s",
         "lease_s=0.0",
-        ("tests/unit/runtime/test_init.py",),
+        ("tests/unit/commands/members/test_init.py",),
         seed=2140,
     ),
     _bug(
@@ -579,7 +579,7 @@ MEMBERSHIP_BUGS = (
         BEATS,
         "    if beat.has_lost_state:\n",
         "    if beat.twins:\n",
-        ("tests/unit/core/test_status.py", "tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
+        ("tests/unit/core/node/test_status.py", "tests/sim/test_status_words.py", "tests/sim/test_restored_state.py"),
         seed=9000013,
     ),
     _bug(
@@ -676,7 +676,7 @@ MEMBERSHIP_BUGS = (
         "    if event.node in node.membership._peers:\n"
         "        node.membership._change(event.node, PeerState.ALIVE, 'token', now)\n"
         "        node.membership._peers[event.node].beat_at = now\n",
-        (*_MEMBERSHIP, "tests/unit/core/test_node.py"),
+        (*_MEMBERSHIP, "tests/unit/core/node/test_node.py"),
     ),
     _bug(
         "vouching ignored",
@@ -935,10 +935,10 @@ VOTE_BUGS = (
     ),
     _bug(
         "a token of a task that we do not know yet is missed",
-        "zsched.core.handlers.work",
+        "zsched.core.node.work",
         "    node.probation.on_token(event.node",
         "    _ = event.task in node.executors and node.probation.on_token(event.node",
-        ("tests/unit/core/test_status.py",),
+        ("tests/unit/core/node/test_status.py",),
     ),
     _bug(
         "a worker that has nothing more to do lacks what it lacked before",
@@ -1005,10 +1005,10 @@ VOTE_BUGS = (
     ),
     _bug(
         "the work of a worker that was killed hangs in the next one",
-        "zsched.core.handlers.work",
+        "zsched.core.node.work",
         "        node.profiler.note_end(event.task)",
         "        pass",
-        ("tests/unit/core/test_node.py",),
+        ("tests/unit/core/node/test_node.py",),
     ),
     _bug(
         "a task that nobody has keeps the margin of its limits",
@@ -1180,10 +1180,10 @@ VOTE_BUGS = (
     ),
     _bug(
         "a program that was tried on one node makes it slow",
-        "zsched.core.handlers.fleet",
+        "zsched.core.node.fleet",
         "((before.worker_on(node), after.worker_on(node)) for",
         "((before.worker, after.worker) for",
-        ("tests/unit/core/handlers/test_fleet.py",),
+        ("tests/unit/core/node/test_fleet.py",),
     ),
     _bug(
         "a foreign worker's word of its jobs stays at home",
@@ -1257,17 +1257,17 @@ VOTE_BUGS = (
     ),
     _bug(
         "each absence of an owner's worker has a start-up time of its own",
-        "zsched.core.absence",
+        "zsched.core.values.absence",
         "self.since = now - self.held_s(limit_s)",
         "self.since = now",
-        ("tests/unit/core/test_absence.py", "tests/unit/core/scheduler/test_judge.py"),
+        ("tests/unit/core/values/test_absence.py", "tests/unit/core/scheduler/test_judge.py"),
     ),
     _bug(
         "what has been away for long is never forgiven",
-        "zsched.core.absence",
+        "zsched.core.values.absence",
         "min(self.total_s + min(away_s, limit_s), 2.0 * limit_s)",
         "self.total_s + min(away_s, limit_s)",
-        ("tests/unit/core/test_absence.py",),
+        ("tests/unit/core/values/test_absence.py",),
     ),
     _bug(
         "an owner whose lease comes and goes never says that it rests",
@@ -1299,7 +1299,7 @@ VOTE_BUGS = (
     ),
     _bug(
         "a drain waits for a candidate whose token comes and goes",
-        "zsched.core.stages",
+        "zsched.core.node.stages",
         "stays = None if owner in left or (told is not None and told.draining) else owner",
         "stays = owner",
         ("tests/sim/test_unseen_streams.py",),
@@ -1313,7 +1313,7 @@ VOTE_BUGS = (
     ),
     _bug(
         "each robot that can do the task itself must see the others' workers",
-        "zsched.core.stages",
+        "zsched.core.node.stages",
         " and self.in_force.voters == (self.me,)",
         "",
         ("tests/sim/test_unseen_streams.py",),
@@ -1341,10 +1341,10 @@ VOTE_BUGS = (
     ),
     _bug(
         "a task that no other machine has room for has a spare",
-        "zsched.core.status",
+        "zsched.core.node.status",
         "if is_ready and (lack is None or lack.filter not in OF_MACHINE):",
         "if is_ready:",
-        ("tests/unit/core/test_status.py",),
+        ("tests/unit/core/node/test_status.py",),
     ),
     _bug(
         "a profile that comes late gives an owner's worker its start-up time again",
@@ -1412,10 +1412,10 @@ VOTE_BUGS = (
     ),
     _bug(
         "a profile waits for its hearer's next deadline",
-        "zsched.core.handlers.choice",
+        "zsched.core.node.choice",
         "is_news=node.profiler.has_news or has_deadlines",
         "is_news=node.profiler.has_news",
-        ("tests/unit/core/test_node.py",),
+        ("tests/unit/core/node/test_node.py",),
     ),
     _bug(
         "what a slow core leaves undone is no need",

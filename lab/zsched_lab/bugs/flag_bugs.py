@@ -8,14 +8,14 @@ from __future__ import annotations
 from zsched_lab.bugs.core_bugs import Bug
 
 FLAGS, DECISION = "zsched.core.scheduler.flags", "zsched.core.scheduler.decision"
-JUDGE, NODE = "zsched.core.scheduler.judge", "zsched.core.node"
+JUDGE, NODE = "zsched.core.scheduler.judge", "zsched.core.node.node"
 ORDERS, DOCUMENTS = "zsched.core.electorate.orders", "zsched.core.electorate.documents"
-HANDLER, APPLY = "zsched.core.handlers.orders", "zsched.commands.apply"
+HANDLER, APPLY = "zsched.core.node.orders", "zsched.commands.act.apply"
 
 _FLAGS = ("tests/unit/core/scheduler/test_flags.py",)
 _JUDGE = ("tests/unit/core/scheduler/test_judge.py",)
 _ORDERS = ("tests/unit/core/electorate/test_orders.py",)
-_DOOR = ("tests/unit/core/handlers/test_orders.py",)
+_DOOR = ("tests/unit/core/node/test_orders.py",)
 
 
 def _bug(name: str, module: str, old: str, new: str, tests: tuple[str, ...], *, has_schedules: bool = False) -> Bug:

@@ -21,23 +21,23 @@ from typing import Any, cast
 
 from zenoh import SampleKind
 
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.core import events as ev
 from zsched.core.hop.receiver import MAX_REPLAYED, RETURN
 from zsched.core.hop.sender import Sender, near
 from zsched.core.hop.serial import serial_of
 from zsched.core.hop.shared import MAX_RECEIVERS, SharedSender
-from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
 from zsched.core.route.ros2 import parse_token
-from zsched.core.sequence import RUN, Order, Track
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
 from zsched.core.values.model import MAX_COUNTER
+from zsched.core.values.relay_protocol import EndMarker, SnapshotChunk, StreamAck, StreamAcks
+from zsched.core.values.sequence import RUN, Order, Track
 from zsched.core.values.words import NAME
-from zsched.hop.acknowledger import Acknowledger
-from zsched.ipc.pipe import decode_chunk, decode_end, encode_chunk, encode_end
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.keyspace import Keyspace, counter, parse
+from zsched.link.pipe.frames import decode_chunk, decode_end, encode_chunk, encode_end
 from zsched.relay.streams.slots import KeyState, Numbers
 from zsched.relay.tokens import Tokens
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace, counter, parse
 from zsched.worker.snapshot import CHUNK, MAX_OFFERS, MAX_SNAPSHOT, Assembly
 from zsched_lab.bugs.fuzz_wire import NAMES
 

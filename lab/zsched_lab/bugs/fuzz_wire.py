@@ -26,15 +26,17 @@ from typing import Any, Union, get_args, get_origin
 
 import msgpack
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
-from zsched.core.node import Node
-from zsched.core.status import build_snapshot
+from zsched.core.node.node import Node
+from zsched.core.node.status import build_snapshot
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat
 from zsched.core.values.document import Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.errors import WireError
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec, electorate_hash
 from zsched.core.values.messages import (
     Accept,
@@ -57,9 +59,7 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import NodeKind, Proposal, ScoreForm, Tuning, Weights
 from zsched.core.values.profile import DeviceSample, Profile, WorkerLoad, WorkerState
 from zsched.core.values.rehearsal import FAULTS, Strike
-from zsched.errors import WireError
-from zsched.ipc import pipe as relay_pipe
-from zsched.wire import codec as wire
+from zsched.link.pipe import frames as relay_pipe
 from zsched_lab.sim.network import mutated
 
 REASONS = frozenset({"size", "garbage", "frame", "version", "kind", "type", "missing", "range", "checksum"})

@@ -9,9 +9,9 @@ from typing import Final
 
 from zsched_lab.bugs.core_bugs import Bug
 
-MEMBERSHIP: Final = "zsched.runtime.membership"
+MEMBERSHIP: Final = "zsched.commands.members.belongings"
 FOUNDING: Final = "zsched.core.electorate.founding"
-INVITATION: Final = "zsched.wire.invitation"
+INVITATION: Final = "zsched.link.invitation"
 
 
 def _bug(name: str, module: str, *changes: tuple[str, str], test: str = "runtime/test_membership.py") -> Bug:
@@ -44,11 +44,11 @@ MEMBER_BUGS: tuple[Bug, ...] = (
     ),
     Bug(
         name="a copied disk is this machine's own",
-        module="zsched.adapters.host.state_file",
+        module="zsched.host.state_file",
         changes=(
             ("        if not is_same_hardware(state.hardware, self._hardware):\n", "        if not state.node:\n"),
         ),
-        tests=("tests/unit/adapters/host/test_state_file.py",),
+        tests=("tests/unit/host/test_state_file.py",),
         has_schedules=False,
     ),
     _bug(

@@ -45,7 +45,7 @@ TESTS = (
     "tests/unit/config/test_timing.py",
     "tests/unit/test_docs.py",
     "tests/unit/commands/test_report.py",
-    "tests/unit/wire/test_codec.py",
+    "tests/unit/core/values/test_codec.py",
 )
 SCHEDULES = 24
 """What no test has found is looked for by this many schedules."""

@@ -148,12 +148,12 @@ PILOT_BUGS: tuple[Bug, ...] = (
     ),
     _node_bug(
         "a node that starts counts the robots of its document",
-        "zsched.core.node",
+        "zsched.core.node.node",
         ("        documents.count_voters(self, todo)\n", ""),
     ),
     Bug(
         name="rounds go by the electors of the file",
-        module="zsched.core.handlers.documents",
+        module="zsched.core.node.documents",
         changes=(
             (
                 "node.in_force.count(node.agreement.voters, node.agreement.electors)",

@@ -11,9 +11,9 @@ from zsched_lab.bugs.core_bugs import AGREEMENT, LEASE, Bug
 
 RECOVERY: Final = "zsched.core.electorate.recovery"
 STRANGERS: Final = "zsched.core.electorate.strangers"
-ON_DISK: Final = "zsched.runtime.recovery"
+ON_DISK: Final = "zsched.commands.members.recovery"
 NUMBERS: Final = "zsched.core.electorate.numbers"
-BEATS: Final = "zsched.core.handlers.beats"
+BEATS: Final = "zsched.core.node.beats"
 _UNIT: Final = "tests/unit/core/electorate/"
 
 
@@ -34,13 +34,13 @@ RECOVERY_BUGS: tuple[Bug, ...] = (
             "generation_id=secrets.token_hex(16)",
             'generation_id=f"{(int(recovery.before.generation_id, 16) + 1) % 2**128:032x}"',
         ),
-        test="tests/unit/runtime/test_recovery.py",
+        test="tests/unit/commands/members/test_recovery.py",
     ),
     _bug(
         "states of two halves are recovered together",
         RECOVERY,
         ("        if generation_of(state) != named:\n", "        if not named:\n"),
-        test="tests/unit/runtime/test_recovery.py",
+        test="tests/unit/commands/members/test_recovery.py",
     ),
     _bug(
         "a majority that can agree is recovered",
@@ -102,9 +102,9 @@ RECOVERY_BUGS: tuple[Bug, ...] = (
     ),
     _bug(
         "a blank disk answers for the seat of its name",
-        "zsched.runtime.init",
+        "zsched.commands.members.blank",
         ("        why=NEW_DISK,\n", '        why="",\n'),
-        test="tests/unit/runtime/test_init.py",
+        test="tests/unit/commands/members/test_init.py",
     ),
     _bug(
         "a node that is to join follows any generation",

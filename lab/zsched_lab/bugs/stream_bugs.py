@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from zsched_lab.bugs.core_bugs import Bug
 
-ACKS, RECEIVER, SERIAL = "zsched.hop.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
+ACKS, RECEIVER, SERIAL = "zsched.link.acknowledger", "zsched.core.hop.receiver", "zsched.core.hop.serial"
 INPUTS, SHARED = "zsched.worker.inputs", "zsched.core.hop.shared"
 KEPT, HELD, SLOTS = "zsched.core.hop.kept", "zsched.core.hop.held", "zsched.relay.streams.slots"
 GREETINGS, SENDER, OUTLET = "zsched.relay.streams.greetings", "zsched.core.hop.sender", "zsched.relay.streams.outlet"
@@ -20,7 +20,7 @@ _TASK = ("tests/parts/relay/test_task.py",)
 _GREETINGS = ("tests/parts/relay/streams/test_greetings.py",)
 _GATES = ("tests/parts/relay/streams/test_gates.py",)
 _RECEIVE = ("tests/parts/relay/streams/test_receive.py",)
-_ACKS = ("tests/unit/hop/test_acknowledger.py",)
+_ACKS = ("tests/unit/link/test_acknowledger.py",)
 _RECEIVER = ("tests/unit/core/hop/test_receiver.py",)
 _HOP = ("tests/sim/test_hop.py",)
 _SENDER = ("tests/unit/core/hop/test_sender.py",)
@@ -329,21 +329,21 @@ STREAM_BUGS = (
         OUTLET,
         "= acks.stalled if acks else contextlib.nullcontext()",
         "= contextlib.nullcontext()",
-        ("tests/parts/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
+        ("tests/parts/link/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
     ),
     _bug(
         "a relay closes links, and reads those it has dialled, with a single thread",
-        "zsched.sessions.config",
+        "zsched.link.sessions.config",
         "return _pools(rx=threads, tx=threads, net=threads, acc=threads)",
         "return _pools(rx=threads, tx=threads, acc=threads)",
-        ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
+        ("tests/unit/link/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
     ),
     _bug(
         "a relay accepts, and reads those that have dialled it, with a single thread",
-        "zsched.sessions.config",
+        "zsched.link.sessions.config",
         "return _pools(rx=threads, tx=threads, net=threads, acc=threads)",
         "return _pools(rx=threads, tx=threads, net=threads)",
-        ("tests/unit/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
+        ("tests/unit/link/sessions/test_config.py", "tests/integration/test_zenoh_pools.py"),
     ),
     _bug(
         "a daemon has as many threads as zenoh likes",
@@ -448,17 +448,17 @@ STREAM_BUGS = (
     ),
     _bug(
         "beats in turn wait for a loop that does not come",
-        "zsched.adapters.network.control_bus",
+        "zsched.link.bus.control_bus",
         "zenoh.handlers.RingChannel(RING)",
         "zenoh.handlers.FifoChannel(RING)",
-        ("tests/parts/adapters/network/test_control_bus.py",),
+        ("tests/parts/link/bus/test_control_bus.py",),
     ),
     _bug(
         "a relay that does not stay is its own node's secret",
         "zsched.core.profile.profile",
         "profile = replace(profile, progress=progress, relay=relay)",
         "profile = replace(profile, progress=progress)",
-        ("tests/unit/core/test_node.py",),
+        ("tests/unit/core/node/test_node.py",),
     ),
     _bug(
         "what class latest has lost is put again by nobody",
@@ -619,7 +619,7 @@ STREAM_BUGS = (
         "zsched.latch",
         "timeout=min(SLICE_S, left_s)",
         "timeout=None if timeout_s is None else left_s",
-        ("tests/unit/test_latch.py::test_a_signal_that_another_thread_has_releases_the_main_thread",),
+        ("tests/unit/host/test_latch.py::test_a_signal_that_another_thread_has_releases_the_main_thread",),
     ),
     _bug(
         "a lease drops what has to be processed again",
@@ -674,7 +674,7 @@ STREAM_BUGS = (
     ),
     _bug(
         "a watch that found no thread counts as begun",
-        "zsched.sessions.stalled_links",
+        "zsched.link.sessions.stalled_links",
         "        with self._lock:\n            if self._thread is None:",
         "        with self._lock:\n            self._wake.set()\n            if self._thread is None:",
         ("tests/unit/relay/test_no_threads.py",),

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from zsched.adapters.radio.network_profiler import parse_trace, read_text
+from zsched.host.radio.network_profiler import parse_trace, read_text
 
 Array = npt.NDArray[np.float64]
 
@@ -110,7 +110,7 @@ class Drive:
 
 
 def read_drive(path: Path, dt_s: float = 0.2, rssi_column: str = "c_rssi") -> Drive:
-    """Read a drive's CSV (see `zsched.adapters.radio.network_profiler.parse_trace`; the signal is read by that code).
+    """Read a drive's CSV (see `zsched.host.radio.network_profiler.parse_trace`; the signal is read by that code).
 
     Raises:
         OSError: the file cannot be read.

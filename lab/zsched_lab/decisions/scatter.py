@@ -15,8 +15,8 @@ import time
 
 import numpy as np
 
-from zsched.adapters.machine.device_profiler import DeviceProfiler
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.host.machine.device_profiler import DeviceProfiler
 from zsched_lab.decisions.loads import Array
 from zsched_lab.fleet.groups import LimitedGroup
 

@@ -20,21 +20,21 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-from zsched.commands.check import check as tell_rules
-from zsched.commands.watch.feed import News, Past
-from zsched.commands.watch.top import Frame, render_top
+from zsched.commands.look.check import check as tell_rules
 from zsched.config.load import check_file
-from zsched.core import events as ev
-from zsched.core.report import snapshot_json
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
+from zsched.core.values import events as ev
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, Hold, HoldTask
 from zsched.core.values.model import Asked, NodeId, TaskId
 from zsched.core.values.plan import WorkerRole
 from zsched.core.values.profile import WorkerLoad, WorkerState
+from zsched.core.values.report import snapshot_json
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import Trouble
+from zsched.tools.watch.feed import News, Past
+from zsched.tools.watch.top import Frame, render_top
 from zsched_lab.sim.simulator import CORES, WALL_MS, Simulator
 
 ROBOTS: Final = ("robot1", "robot2", "robot3")

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 import psutil
 
-from zsched.adapters.machine.device_profiler import DeviceProfiler
+from zsched.host.machine.device_profiler import DeviceProfiler
 from zsched_lab.decisions.loads import Array
 
 PERIOD_S: Final = 0.2

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from zsched.errors import ConfigError, ZschedError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
+from zsched.core.values.errors import ConfigError, ZschedError
+from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched_lab.demo.evaluate import evaluate, print_summary
 from zsched_lab.demo.live_view import make_view
 from zsched_lab.demo.run import DemoRun, RunPlan

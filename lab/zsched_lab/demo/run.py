@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsched.adapters.host.operator_client import ask
-from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
+from zsched.host.clock import monotonic_s
+from zsched.host.operator_client import ask
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.demo.evaluate import RunFacts
 from zsched_lab.demo.live_view import View

@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from zsched.errors import ConfigError
-from zsched.exits import EXIT_CONFIG
+from zsched.core.values.errors import ConfigError
+from zsched.core.values.exits import EXIT_CONFIG
 from zsched_lab.explore.body import Limits
 from zsched_lab.explore.picture import Picture, save_pictures
 from zsched_lab.explore.virtual import VirtualResult, VirtualRun, run_virtual

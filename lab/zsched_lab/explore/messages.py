@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
 from zsched.tasks.map_merge.cdr import CdrError, decode_transforms
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.explore.frontier import Claim

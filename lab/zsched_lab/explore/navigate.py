@@ -26,8 +26,8 @@ import time
 import cv2
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
+from zsched.host.clock import monotonic_s
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.explore.agent import CLAIM_PERIOD_S

@@ -42,9 +42,9 @@ from pathlib import Path
 import cv2
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.errors import ConfigError, WireError
-from zsched.exits import EXIT_CONFIG
+from zsched.core.values.errors import ConfigError, WireError
+from zsched.core.values.exits import EXIT_CONFIG
+from zsched.host.clock import monotonic_s
 from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2

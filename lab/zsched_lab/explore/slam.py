@@ -24,8 +24,8 @@ import time
 import cv2
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
+from zsched.host.clock import monotonic_s
 from zsched.tasks.map_merge.__main__ import metres_per_cell
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched_lab.explore.agent import MAP_PERIOD_S

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
 from zsched_lab.explore.laser import SCAN_PERIOD_S, LaserScan

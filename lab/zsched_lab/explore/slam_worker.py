@@ -18,8 +18,8 @@ import threading
 
 import cv2
 
-from zsched.clock import monotonic_s
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
+from zsched.host.clock import monotonic_s
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.worker import Received, Worker
 from zsched_lab.explore.messages import decode_scan, encode_correction

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Cells, Grid, Mask
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
 from zsched_lab.explore.office import OfficeSize, office
 from zsched_lab.explore.world import World, read_map_server, shipped
 

@@ -13,7 +13,7 @@ import os
 import sys
 from pathlib import Path
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 from zsched.worker import Worker
 
 PERIOD_S = 0.01

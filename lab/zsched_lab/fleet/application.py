@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.sessions.config import client_config
+from zsched.host.clock import monotonic_s
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.signals import StopFlag
 
 CONNECT_S = 30.0

@@ -3,7 +3,7 @@
 Knows: process groups, logs, the janitor. Does not know: what the processes are.
 
 Three nets, each for what the one before misses: an orderly stop (SIGTERM, then SIGKILL, by process group), the parent
-death signal (`zsched.adapters.workers.launch`) when the lab is killed, and the janitor, which finds every process of
+death signal (`zsched.host.workers.launch`) when the lab is killed, and the janitor, which finds every process of
 the run by its environment. Start children from the main thread only: the death signal follows the thread that forked.
 """
 
@@ -22,8 +22,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from zsched.adapters.workers import launch
-from zsched.errors import ZschedError
+from zsched.core.values.errors import ZschedError
+from zsched.host.workers import launch
 from zsched_lab.fleet.janitor import TOKEN_VARIABLE
 
 STOP_GRACE_S = 3.0

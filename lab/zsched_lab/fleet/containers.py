@@ -16,7 +16,7 @@ import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from zsched.errors import ZschedError
+from zsched.core.values.errors import ZschedError
 
 REPO = Path(__file__).parents[3]
 SYSTEM = ("/bin", "/lib", "/lib64", "/usr")

@@ -21,7 +21,7 @@ import threading
 import time
 from typing import Final
 
-from zsched.guard import guarded
+from zsched.host.guard import guarded
 
 TUNSETIFF: Final = 0x400454CA
 IFF_TAP, IFF_NO_PI = 0x0002, 0x1000

@@ -1,7 +1,7 @@
 """Makes control groups with a quota, for nodes of the lab, where the user may (v1, v2 or both).
 
 Knows: the files of both versions (kernel: admin-guide/cgroup-v1, admin-guide/cgroup-v2). Does not know: which group
-limits a process (`zsched.adapters.machine.cgroup`), nodes.
+limits a process (`zsched.host.machine.cgroup`), nodes.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import os
 import time
 from pathlib import Path
 
-from zsched.adapters.machine.cgroup import MIB, CgroupTree, text_of
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.host.machine.cgroup import MIB, CgroupTree, text_of
 
 PERIOD_US = 20_000
 """Period of the quotas we set: a throttled process stands still for less than 20 ms instead of the usual 100."""

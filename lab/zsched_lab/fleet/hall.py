@@ -16,8 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from zsched.adapters.host.operator_client import ask
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.host.operator_client import ask
 from zsched_lab.fleet.netbed import stop_group
 from zsched_lab.fleet.netns import Network
 

@@ -13,8 +13,8 @@ import os
 from collections.abc import Mapping
 from enum import StrEnum
 
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.model import NodeId
-from zsched.errors import AdapterError
 from zsched_lab.fleet.groups import LimitedGroup
 
 

@@ -23,13 +23,13 @@ from typing import IO
 
 import psutil
 
-from zsched.adapters.host.operator_client import ask
-from zsched.clock import monotonic_s
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, PeerState
-from zsched.guard import guarded
-from zsched.paths import socket_path
-from zsched.sessions import config as zenoh_config
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded
+from zsched.host.operator_client import ask
+from zsched.host.paths import socket_path
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.netns import Network
 from zsched_lab.fleet.testbed import DAEMON, Json, Testbed
 from zsched_lab.sim.history import History, Learnt, Started

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from zsched.errors import ZschedError
+from zsched.core.values.errors import ZschedError
 
 PREFIX: Final = "zsched-net"
 NET: Final = "198.18.0"

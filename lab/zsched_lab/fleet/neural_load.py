@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet.signals import StopFlag
 
 Frame = npt.NDArray[np.float32]

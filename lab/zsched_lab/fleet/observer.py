@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
-from zsched.clock import monotonic_s
+from zsched.core.values.errors import ZschedError
 from zsched.core.values.model import NodeId, TaskId
-from zsched.errors import ZschedError
-from zsched.guard import guarded
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded
 from zsched_lab.fleet.runner import Ask
 from zsched_lab.fleet.view import Move, Status, merge_moves, past_allocations
 

@@ -20,10 +20,10 @@ from typing import Any, Self
 
 import zenoh
 
-from zsched import paths as places
-from zsched.guard import guarded
-from zsched.ipc.relay_socket import relay_pid
-from zsched.sessions.config import client_config
+from zsched.host import paths as places
+from zsched.host.guard import guarded
+from zsched.link.pipe.relay_socket import relay_pid
+from zsched.link.sessions.config import client_config
 from zsched_lab.fleet.hall import Hall, block_of_ports
 from zsched_lab.fleet.testbed import TASK, echo_fleet
 

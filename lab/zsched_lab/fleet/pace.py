@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from zsched.guard import guarded
+from zsched.host.guard import guarded
 
 
 @contextmanager

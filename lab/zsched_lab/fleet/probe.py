@@ -20,8 +20,8 @@ import time
 
 import zenoh
 
-from zsched.clock import monotonic_s
-from zsched.guard import guarded
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded
 
 OPEN_S = 120.0
 """A relay takes 20 s to start on a machine where a dozen processes start beside it; a hang takes longer."""

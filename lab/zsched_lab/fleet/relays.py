@@ -18,15 +18,15 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import RelayChanged, SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport, WorkerSeen
+from zsched.core.values.events import RelayChanged, SlotFlipped, SlotReady
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, Slot, WorkerRole
-from zsched.ipc.protocol import RelayHello
-from zsched.ipc.relay_socket import PROTOCOL
-from zsched.paths import relay_path
-from zsched.sessions.config import DEFAULT_TIMING, data_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport, WorkerSeen
+from zsched.host.paths import relay_path
+from zsched.link.pipe.protocol import RelayHello
+from zsched.link.pipe.relay_socket import PROTOCOL
+from zsched.link.sessions.config import DEFAULT_TIMING, data_config, worker_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched_lab.fleet.loopback import free_endpoint
 from zsched_lab.fleet.waiting import DEADLINE_S, until
 
@@ -167,7 +167,7 @@ class Relays:
         self.incarnation += 1
         task = task or self.task
         path = self.folder / f"{task}-{node}.json5"
-        # its own relay first, then the robot's, as `zsched.runtime.endpoints` has it: what is dialled is dialled again
+        # its own relay first, then the robot's, as `zsched.link.sessions.endpoints` has it; it is dialled again
         connect = tuple(dict.fromkeys((self.endpoint(node), self.endpoint(ROBOT), *self.dialled)))
         gossip: dict[str, Any] = {} if self.dials_by_gossip else {"listen": (), "dials_by_gossip": False}
         text = worker_config(

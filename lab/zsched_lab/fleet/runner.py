@@ -14,8 +14,8 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import NodeId, TaskId
-from zsched.errors import ConfigError
 from zsched_lab.fleet.children import Child, ChildError, Children
 from zsched_lab.fleet.limits import NodeLimits
 from zsched_lab.fleet.loopback import free_endpoints, own_address
@@ -29,7 +29,7 @@ POLL_S = 0.05
 Tree = dict[str, Any]
 """A fleet file as plain YAML data."""
 Ask = Callable[[Path, Tree, float], Tree]
-"""`zsched.adapters.host.operator_client.ask`: (socket, request, seconds) -> answer."""
+"""`zsched.host.operator_client.ask`: (socket, request, seconds) -> answer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,12 +12,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from zsched.core.values.certificates import Role
+from zsched.host.key_files import PRIVATE, PUBLIC, make_folder, write_whole
+from zsched.link.sessions.access_rules import Side
+from zsched.link.sessions.config import control_config, data_config
+from zsched.link.sessions.secured import CERTIFICATE, KEY, TRUSTED
+from zsched.link.sessions.tls import session_text
 from zsched.pki.authority import Authority, create
-from zsched.pki.files import PRIVATE, PUBLIC, make_folder, write_whole
-from zsched.runtime.access_rules import Side
-from zsched.runtime.secured import CERTIFICATE, KEY, TRUSTED
-from zsched.runtime.tls import session_text
-from zsched.sessions.config import control_config, data_config
 from zsched_lab.fleet.testbed import Json, Testbed
 
 

@@ -24,17 +24,17 @@ from typing import Any, Self, TypeVar
 import psutil
 import zenoh
 
-from zsched import paths as places
-from zsched.adapters.host.operator_client import ask
+from zsched.commands.members.blank import init_state
 from zsched.config.load import load_fleet
 from zsched.core.hop.books import unaccounted
+from zsched.core.values.errors import AdapterError, ZschedError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import StreamCount
-from zsched.errors import AdapterError, ZschedError
-from zsched.ipc.relay_socket import relay_pid
-from zsched.runtime.init import init_state
-from zsched.sessions import config as zenoh_config
+from zsched.host import paths as places
+from zsched.host.operator_client import ask
+from zsched.link.pipe.relay_socket import relay_pid
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.loopback import free_endpoint, own_address
 
 DAEMON = (sys.executable, "-m", "zsched.daemon")

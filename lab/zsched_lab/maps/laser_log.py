@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from zsched.errors import ConfigError
-from zsched.files import read_packed
+from zsched.core.values.errors import ConfigError
+from zsched.host.files import read_packed
 from zsched.tasks.map_merge.geometry import FloatArray, Pose2
 
 MAX_LOG_BYTES = 256 << 20

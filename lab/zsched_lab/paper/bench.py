@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from zsched import __version__
-from zsched.errors import ConfigError, ZschedError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
+from zsched.core.values.errors import ConfigError, ZschedError
+from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_SIGNAL, EXIT_USAGE
 from zsched_lab.fleet.netns import why_not
 from zsched_lab.fleet.runner import read_tree
 from zsched_lab.fleet.signals import Interrupted, interruptible

@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 from zsched_lab.fleet.neural_load import Network, frames, load_network
 from zsched_lab.fleet.signals import StopFlag
 

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from zsched.adapters.radio.network_profiler import Trace, parse_trace, read_text
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import LinkSpec
 from zsched.core.values.model import NodeId
 from zsched.core.values.profile import LinkSource
+from zsched.host.radio.network_profiler import Trace, parse_trace, read_text
 
 STEP_S = 0.1
 LONGEST_START_S = 60.0

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.model import NodeId
-from zsched.errors import AdapterError
 from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.runner import LabFleet

@@ -12,8 +12,8 @@ import math
 import random
 from pathlib import Path
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import NodeId
-from zsched.errors import ConfigError
 from zsched_lab.paper.scenario import Radio
 
 STEP_S = 0.2

@@ -29,11 +29,11 @@ from typing import IO
 import zenoh
 from mcap.writer import Writer
 
-from zsched.adapters.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
-from zsched.clock import monotonic_s
-from zsched.commands.watch.tracks import GRID, ROS_DEFINITIONS
 from zsched.core.values.model import NodeId
+from zsched.host.clock import monotonic_s
+from zsched.host.machine.cgroup import CgroupTree, CpuQuota, MemoryQuota
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid
+from zsched.tools.watch.tracks import GRID, ROS_DEFINITIONS
 from zsched_lab.fleet.application import connect
 from zsched_lab.fleet.signals import StopFlag
 

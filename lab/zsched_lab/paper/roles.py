@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from zsched.core.values.model import NodeId
-from zsched.procfs import parse_process_stat, read_file
+from zsched.host.procfs import parse_process_stat, read_file
 
 ROLES = (
     ("zsched_lab.explore.slam", "slam"),

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from zsched import daemon
 from zsched.core.scheduler import rounds
-from zsched.guard import end_with
+from zsched.host.guard import end_with
 from zsched_lab.paper.rules import JudgeMaker, RuleName
 
 

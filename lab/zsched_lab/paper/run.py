@@ -23,10 +23,10 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from zsched import __version__
-from zsched.adapters.host.operator_client import ask
-from zsched.adapters.machine.core_speed import processor
-from zsched.clock import monotonic_s
 from zsched.core.values.model import NodeId
+from zsched.host.clock import monotonic_s
+from zsched.host.machine.core_speed import processor
+from zsched.host.operator_client import ask
 from zsched.tasks.map_merge.merger import Mode
 from zsched_lab.demo.run import worker_options
 from zsched_lab.fleet.children import ChildError, Children

@@ -15,9 +15,9 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import NodeId
 from zsched.core.values.words import check_range
-from zsched.errors import ConfigError
 from zsched.tasks.map_merge.merger import Mode
 from zsched.tasks.map_merge.pairs import Rule
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import NodeId
-from zsched.errors import ConfigError
 from zsched_lab.paper.rules import RuleName
 
 PAPER_BONUS = 0.05

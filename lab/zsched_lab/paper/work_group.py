@@ -10,7 +10,7 @@ import os
 import sys
 from typing import Final
 
-from zsched.adapters.machine.cgroup import CgroupTree
+from zsched.host.machine.cgroup import CgroupTree
 from zsched_lab.fleet.groups import LimitedGroup
 
 OWN: Final = "own"

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import zenoh
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 from zsched.tasks.map_merge.cdr import CdrError, decode_grid, encode_grid
 from zsched_lab.fleet import application
 from zsched_lab.fleet.recorder import Record, Recorder

@@ -17,8 +17,8 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, field
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.messages import ChangeFleet
 from zsched.core.values.model import NodeKind, Tuning, Weights

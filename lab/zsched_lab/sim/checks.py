@@ -11,21 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.scheduler.flags import HANDS_OVER
 from zsched.core.scheduler.fuse import ESCAPES_PER_MINUTE, WINDOW_S
+from zsched.core.values import instructions as do
+from zsched.core.values.codec import as_plain, from_plain
 from zsched.core.values.decision import Decision
 from zsched.core.values.durable import DurableState
+from zsched.core.values.errors import InvariantError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Accepted, Promise
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Ballot, NodeId, Proposal, RegisterState, TaskId
 from zsched.core.values.plan import Role, RoutePlan, WorkerRole
 from zsched.core.values.profile import WorkerState
 from zsched.core.vote.belief import GENERATION_STEP
-from zsched.errors import InvariantError
-from zsched.wire.codec import as_plain, from_plain
 from zsched_lab.sim.history import Checker, Learnt, Record, Routed, Started, Stored, Worked
 from zsched_lab.sim.parts import Machine
 

@@ -3,7 +3,7 @@
 Knows: what the watch reports meanwhile and afterwards. Does not know: what a node makes of it
 (`zsched.core.vote.clocks`).
 
-Decisions go by a clock that nothing slews (`zsched.clock`), so a slew changes no time here: it is only reported.
+Decisions go by a clock that nothing slews (`zsched.host.clock`), so a slew changes no time here: it is only reported.
 A machine that has slept knows how long, some to a second only: then its clock is wrong from there on.
 """
 
@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from zsched.clock import WINDOW_S, ClockWatch
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.vote.clocks import DOUBT_S
+from zsched.host.clock import WINDOW_S, ClockWatch
 
 LOOK_S = 0.2
 """The watch compares the clocks so often."""

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.document import Document, Flag, Text
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, RegisterState
-from zsched.wire import codec as wire
 from zsched_lab.sim.chosen import Chosen
 from zsched_lab.sim.network import Message
 from zsched_lab.sim.parts import Machine

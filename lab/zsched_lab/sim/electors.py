@@ -14,15 +14,15 @@ from typing import Final
 from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.founding import recovered
 from zsched.core.electorate.roll import Admission, Roll
-from zsched.core.instructions import AskElectors, AskFleet, SendAccept, SendPrepare, TellFleet
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner, Rewrite, RoundOutcome
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.fleet import Timing
+from zsched.core.values.instructions import AskElectors, AskFleet, SendAccept, SendPrepare, TellFleet
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId, Tuning, Weights
 from zsched.core.values.struct import replace
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import CREATION_STEP
 from zsched_lab.sim.chosen import Chosen
 

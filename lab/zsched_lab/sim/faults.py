@@ -12,14 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
+from zsched.core.values.errors import InvariantError
 from zsched.core.values.fleet import lease_terms
 from zsched.core.values.messages import CommandOutcome, TuneTask
 from zsched.core.values.model import NodeId, Weights
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import replace
-from zsched.errors import InvariantError
 from zsched_lab.sim.checks import DisagreementError
 from zsched_lab.sim.clocks import slew
 from zsched_lab.sim.disk_faults import DiskFaults
@@ -213,7 +213,7 @@ class Stage:
     def _needs_restart(machine: Machine) -> bool:
         """Whether it runs with other electors, or by another length of leases, than its file says.
 
-        A reload changes neither. The daemon says so and asks for the restart (`zsched.runtime.restarts`): until then an
+        A reload changes neither. The daemon asks for the restart (`zsched.link.sessions.restarts`): until then an
         owner and electors of two lengths grant each other nothing.
         """
         return machine.node is not None and lease_terms(machine.node.fleet) != lease_terms(machine.fleet)

@@ -22,9 +22,9 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from random import Random
 
-from zsched.core import events as ev
 from zsched.core.electorate.founding import founded_id
 from zsched.core.scheduler.flags import HANDS_OVER
+from zsched.core.values import events as ev
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched_lab.sim.links import SELF_DELAY_S, Pair
 from zsched_lab.sim.scene import Carry, Scene
 from zsched_lab.sim.swarm import Fault

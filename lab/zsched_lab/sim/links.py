@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass, field
 from random import Random
 
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.model import NodeId
 from zsched_lab.sim.loops import Loops
 from zsched_lab.sim.network import Message, Weather

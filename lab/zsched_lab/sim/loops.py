@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from zsched.core import events as ev
-from zsched.core.node import in_parts
+from zsched.core.node.node import in_parts
+from zsched.core.values import events as ev
 from zsched_lab.sim.parts import Machine
 
 TICK_S = 0.0005

@@ -21,7 +21,7 @@ from zsched.core.electorate.recovery import (
     new_member,
     rejoined,
 )
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue

@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
-from zsched.core import events as ev
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values.errors import InvariantError, WireError
 from zsched.core.values.messages import Ballots, Votes, fleet_answer
 from zsched.core.values.model import Ballot, NodeId
 from zsched.core.values.struct import replace
-from zsched.errors import InvariantError, WireError
-from zsched.wire import codec as wire
 from zsched_lab.sim.checks import FORGED
 
 GHOST = "ghost"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from random import Random
 from typing import Final
 
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Hold, HoldTask, MoveTask
 from zsched.core.values.model import Asked, NodeId

@@ -10,15 +10,15 @@ from collections import deque
 from dataclasses import dataclass, field
 from random import Random
 
-from zsched.core import events as ev
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
 from zsched.core.values.durable import DurableState
+from zsched.core.values.errors import WireError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.plan import Role
 from zsched.core.values.problems import Problem
-from zsched.errors import WireError
-from zsched.wire import codec as wire
 
 PAST_KEPT = 64
 

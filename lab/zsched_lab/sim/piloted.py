@@ -21,7 +21,6 @@ from typing import Final
 from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.pilot import Course, Pilot, Word
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner, RoundOutcome
 from zsched.core.values.electorate import Creation, FleetValue
@@ -29,6 +28,7 @@ from zsched.core.values.fleet import Fleet, TaskSpec, Timing
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Accepted, Refusal
 from zsched.core.values.model import Allocation, NodeId, NodeKind, RegisterState, TaskId
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.lease import Leases
 from zsched_lab.sim.chosen import ChosenError
 from zsched_lab.sim.electors import (

@@ -21,9 +21,9 @@ from zsched.core.electorate.recovery import (
     rejoined,
     sides_of,
 )
+from zsched.core.values import codec as wire
 from zsched.core.values.model import NodeId
 from zsched.core.values.problems import Problem
-from zsched.wire import codec as wire
 from zsched_lab.sim.checks import DisagreementError
 from zsched_lab.sim.members import Members
 from zsched_lab.sim.parts import Machine

@@ -14,11 +14,12 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any, TypeVar
 
-from zsched.clock import NAP_S
-from zsched.core import events as ev
-from zsched.core import instructions as do
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.durable import DurableState
+from zsched.core.values.errors import InvariantError, WireError
 from zsched.core.values.fleet import Fleet, electorate_hash, fleet_hash
 from zsched.core.values.messages import FleetQuestion, Refused, fleet_question
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId
@@ -27,8 +28,7 @@ from zsched.core.values.profile import DeviceSample, WorkerLoad
 from zsched.core.values.struct import replace
 from zsched.core.values.words import Readings
 from zsched.core.vote.generations import blank_state
-from zsched.errors import InvariantError, WireError
-from zsched.wire import codec as wire
+from zsched.host.clock import NAP_S
 from zsched_lab.sim.checks import Invariants, are_same, check_replayed, unsettled
 from zsched_lab.sim.clocks import LOOK_S, awake
 from zsched_lab.sim.documents import Documents
@@ -135,7 +135,7 @@ class Simulator(Links):
 
     @property
     def wall_count(self) -> int:
-        """The incarnation that a blank state or none begins with (`zsched.clock.wall_tenths`).
+        """The incarnation that a blank state or none begins with (`zsched.host.clock.wall_tenths`).
 
         Finer than a tenth of a second: these machines can be wiped and started more often than any real one.
         """

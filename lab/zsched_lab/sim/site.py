@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from zsched.core import events as ev
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet, NodeSpec, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.model import NodeId, NodeKind, PeerState, Tuning, Weights
 from zsched_lab.sim.links import Pair

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zsched.core.status import build_snapshot
+from zsched.core.node.status import build_snapshot
 from zsched.core.values.model import NodeId, PeerState
 from zsched.core.values.problems import Problem
 from zsched.core.values.quorum import majority

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Any, Protocol
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import Role, RoutePhase, RoutePlan, WorkerRole

@@ -10,14 +10,14 @@ import pytest
 
 from support.doors import answering
 from support.schemas import faults
-from zsched.commands import ask
-from zsched.commands.ask import ask_door, find_door
-from zsched.commands.cells import show_site
-from zsched.commands.change import asker, user_name
-from zsched.commands.common import CliError, Json
-from zsched.commands.history import history
-from zsched.commands.options import Answers
-from zsched.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.commands.base.change import asker, user_name
+from zsched.commands.base import ask
+from zsched.commands.base.ask import ask_door, find_door
+from zsched.commands.base.common import CliError, Json
+from zsched.commands.base.options import Answers
+from zsched.commands.look.cells import show_site
+from zsched.commands.look.history import history
+from zsched.core.values.exits import EXIT_OK, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched_lab.fleet.loopback import free_endpoint, own_address
 
 

@@ -16,10 +16,10 @@ from support.clinic import FLEET
 from support.schemas import faults
 from zsched.cli import app
 from zsched.config.load import load_fleet
+from zsched.core.values import codec as wire
 from zsched.core.values.snapshot import NodeStatus, QuorumStatus, Snapshot
-from zsched.sessions import config as zenoh_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions import config as zenoh_config
 from zsched_lab.fleet.loopback import free_endpoint
 
 KEYS = Keyspace("hall")

@@ -10,7 +10,7 @@ import zenoh
 
 from support.sessions import hub_and_neighbour
 from support.waiting import until
-from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
+from zsched.core.values.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.relay.matching import SETTLE_S, Matching
 
 WATCH = WorkerWatch(task="merge", inputs=("edge1/merge/*/map", "edge1/merge/*/scan"), strangers=("Nobody/merge/*/map",))

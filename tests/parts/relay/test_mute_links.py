@@ -10,7 +10,7 @@ import pytest
 from support.programs import process
 from support.waiting import until
 from zsched.core.values.fleet import Timing
-from zsched.sessions.config import data_config, worker_config
+from zsched.link.sessions.config import data_config, worker_config
 from zsched_lab.fleet import netns
 
 pytestmark = [
@@ -24,7 +24,7 @@ MENDED_S, SLACK_S = 4.0, 4.0
 RELAY = """
 import sys, time, zenoh
 from zsched.relay.mute_links import MuteLinks
-from zsched.wire.keyspace import Keyspace
+from zsched.link.keyspace import Keyspace
 session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
 mute, tokens = MuteLinks(session, Keyspace("hall")), set()
 def note(sample):

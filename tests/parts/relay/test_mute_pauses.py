@@ -11,9 +11,9 @@ import pytest
 from support.sessions import hub_and_neighbour
 from support.waiting import until
 from zsched.core.values.model import NodeId
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.link_sockets import LinkSocket
 from zsched.relay.mute_links import QUIET_BYTES, MuteLinks
-from zsched.sessions.link_sockets import LinkSocket
-from zsched.wire.keyspace import Keyspace
 
 MISSED = frozenset({NodeId("edge1")})
 

@@ -13,11 +13,11 @@ from support.waiting import until
 from zsched.core.hop.books import unaccounted
 from zsched.core.values.plan import Direction, Route, StreamClass, StreamSettings
 from zsched.core.values.struct import replace
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions import send_queue
 from zsched.relay.open_streams import OpenStreams
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.outlet import QUEUE_DEPTH
-from zsched.sessions import send_queue
-from zsched.wire.keyspace import Keyspace
 
 IN = Route(
     stream="t/in/0",

@@ -12,8 +12,8 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.relay_protocol import REFUSED_ENCODING, ServiceProblem
 from zsched.core.values.plan import Direction, Route, ServiceSettings, StreamSettings
+from zsched.core.values.relay_protocol import REFUSED_ENCODING, ServiceProblem
 from zsched.core.values.struct import replace
 from zsched.relay.services import service
 from zsched.relay.services.replies import Replies

@@ -18,13 +18,11 @@ from support.fleets import task_of
 from support.sessions import hub_and_neighbour, matches
 from support.threads import no_threads
 from support.waiting import until
-from zsched.clock import monotonic_s
-from zsched.core.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.executor.handover import Executor, Phase
-from zsched.core.instructions import ApplyRoutes
-from zsched.core.relay_protocol import RelayReport, StreamAck, StreamAcks, TaskEnded, WorkerWatch
-from zsched.core.todo import ToDo
+from zsched.core.values import codec as wire
+from zsched.core.values.events import ProblemReported, SlotDrained, SlotFlipped, SlotReady
 from zsched.core.values.fleet import StreamRule, WorkerSpec
+from zsched.core.values.instructions import ApplyRoutes
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
@@ -38,8 +36,12 @@ from zsched.core.values.plan import (
     StreamCount,
     StreamSettings,
 )
+from zsched.core.values.relay_protocol import RelayReport, StreamAck, StreamAcks, TaskEnded, WorkerWatch
 from zsched.core.values.struct import replace
-from zsched.ipc.pipe import decode_end
+from zsched.core.values.todo import ToDo
+from zsched.host.clock import monotonic_s
+from zsched.link.keyspace import END_CHUNK, Keyspace
+from zsched.link.pipe.frames import decode_end
 from zsched.relay import task as task_module
 from zsched.relay.graph import GraphMirror
 from zsched.relay.open_streams import OpenStreams
@@ -49,8 +51,6 @@ from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.receive import undeclare
 from zsched.relay.task import TaskRelay
 from zsched.relay.tokens import Tokens
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK, Keyspace
 
 KEYS = Keyspace("test")
 IN = Route(

@@ -13,18 +13,18 @@ import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
 from support.waiting import until
-from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
-from zsched.core import events as ev
-from zsched.core.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON
 from zsched.core.values.plan import ReadyWhen
 from zsched.core.values.profile import WorkerState
+from zsched.core.values.relay_protocol import WorkerMatched, WorkerSeen, WorkerTrouble
 from zsched.core.values.words import Trouble, told_of_worker
+from zsched.host.workers.supervisor import WorkerContext, WorkerSupervisor
+from zsched.link.sessions.config import worker_config
 from zsched.runtime import crew as crew_module
 from zsched.runtime.crew import OTHERS, Crew
 from zsched.runtime.sessions import SessionsRead
-from zsched.sessions.config import worker_config
 
 SLEEPER = ("python", "-c", "import time; time.sleep(600)")
 TUNING = tuning_of(cpu=1.0, memory=0.0)

@@ -20,21 +20,18 @@ from support.profiles import profile_of
 from support.proposals import proposal_of
 from support.states import state_of
 from support.waiting import until
-from zsched.adapters.host.decision_log import DecisionLog
-from zsched.adapters.host.state_file import StateFile
-from zsched.adapters.workers.kept_lines import KeptLines
-from zsched.adapters.workers.supervisor import WorkerContext, WorkerSupervisor
-from zsched.commands import ask
-from zsched.commands.history import moves_of
+from zsched.commands.base import ask
+from zsched.commands.look.history import moves_of
 from zsched.config.timing import WAN
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
-from zsched.core.relay_protocol import RelayStarted, WorkerSeen
+from zsched.core.values import events as ev
 from zsched.core.values import fleet as fleet_values
+from zsched.core.values import instructions as do
+from zsched.core.values.codec import document_hash
 from zsched.core.values.decision import Explanation, Move
 from zsched.core.values.document import Document, Flag, FlagKind, Text
 from zsched.core.values.durable import DurableState
+from zsched.core.values.errors import AdapterError, WireError
 from zsched.core.values.fleet import MOST_ORDER_S, Fleet, Timing, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
@@ -60,14 +57,17 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Acceptance, Asked, Tuning, Weights
 from zsched.core.values.plan import STILL_S, Role, RoutePhase, RoutePlan, StreamCount, WorkerRole
 from zsched.core.values.profile import WorkerState
-from zsched.errors import AdapterError, WireError
-from zsched.runtime import desk as desk_module
+from zsched.core.values.relay_protocol import RelayStarted, WorkerSeen
+from zsched.host.decision_log import DecisionLog
+from zsched.host.state_file import StateFile
+from zsched.host.workers.kept_lines import KeptLines
+from zsched.host.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.runtime import shell as shell_module
-from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk, command_of
+from zsched.link.requests import COMMANDS, command_of
+from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk
 from zsched.runtime.inbox import INBOX_LIMIT, WAITING_LIMIT, Inbox
 from zsched.runtime.library import Library
 from zsched.runtime.shell import FOLLOW_AGAIN_S, PROBLEM_TTL_S, Shell
-from zsched.wire.codec import document_hash
 
 BALLOT = ballot_of()
 VALUE = allocation_of()
@@ -438,7 +438,7 @@ def test_an_order_becomes_the_event_that_says_all_of_it() -> None:
 
 def test_the_command_line_waits_as_long_as_the_desk_and_for_the_same_orders() -> None:
     """It names them by their verbs: the values' classes, and zenoh, are not loaded for a question."""
-    made = {verb: get_type_hints(make)["return"] for verb, make in desk_module._COMMANDS.items()}
+    made = {verb: get_type_hints(make)["return"] for verb, make in COMMANDS.items()}
     assert {verb for verb, kind in made.items() if issubclass(kind, Agreed)} == ask.AGREED
     assert {verb for verb, kind in made.items() if issubclass(kind, Asking)} <= ask.READS
     assert ask.ORDER_TIMEOUT_S > MOST_ORDER_S

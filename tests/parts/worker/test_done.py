@@ -11,12 +11,12 @@ import zenoh
 
 from support.hand_relay import KEYS, Relay, environment
 from support.waiting import until, within
-from zsched.clock import monotonic_s
 from zsched.core.hop.shared import STALLED_S
-from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import WorkerRole
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import AGAIN_CHUNK
+from zsched.core.values.relay_protocol import StreamAck, StreamAcks
+from zsched.host.clock import monotonic_s
+from zsched.link.keyspace import AGAIN_CHUNK
 from zsched.worker import Output, Received, Worker
 
 OUT = "edge1/t/1/shared/out"

@@ -13,12 +13,12 @@ import pytest
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.events import FrameDropped, WorkerJobs
-from zsched.core.relay_protocol import WorkerTrouble
-from zsched.hop.acknowledger import Acknowledger
+from zsched.core.values import codec as wire
+from zsched.core.values.events import FrameDropped, WorkerJobs
+from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import Keyspace
 from zsched.relay.troubles import PAUSE_S, Troubles, Word
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 from zsched.worker import jobs as worker_jobs
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import TELL_S, JobBook, JobTimer

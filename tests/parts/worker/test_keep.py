@@ -11,14 +11,14 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.clock import monotonic_s
 from zsched.core.hop import shared
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
-from zsched.hop.acknowledger import Acknowledger
-from zsched.ipc.pipe import decode_end
-from zsched.sessions.stalled_links import StalledLinks
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.core.values import codec as wire
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks, mark_of
+from zsched.host.clock import monotonic_s
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.link.pipe.frames import decode_end
+from zsched.link.sessions.stalled_links import StalledLinks
 from zsched.worker import keep as worker_keep
 from zsched.worker.keep import Debts, Keeper, KeptLane
 

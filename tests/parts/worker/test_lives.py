@@ -9,8 +9,8 @@ import zenoh
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched.sessions.config import data_config, worker_config
-from zsched.wire.keyspace import Keyspace
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.worker import lives
 from zsched.worker.lives import RelayLives
 

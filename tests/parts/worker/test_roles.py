@@ -11,11 +11,11 @@ import zenoh
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import Role, WorkerRole
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.config import data_config, relay_endpoint, worker_config
 from zsched.relay.roles import RoleServer
-from zsched.sessions.config import data_config, relay_endpoint, worker_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 from zsched.worker.roles import RoleWatch
 
 KEYS = Keyspace("test")

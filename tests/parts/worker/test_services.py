@@ -10,8 +10,8 @@ import pytest
 import zenoh
 
 from support.waiting import until
-from zsched.core.relay_protocol import ERROR_ENCODING
-from zsched.sessions.config import data_config
+from zsched.core.values.relay_protocol import ERROR_ENCODING
+from zsched.link.sessions.config import data_config
 from zsched.worker.jobs import JobBook
 from zsched.worker.services import Request, Service
 from zsched.worker.troubles import Troubles

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
-from zsched.core.relay_protocol import SnapshotChunk
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.ipc.pipe import encode_chunk
-from zsched.sessions.config import client_config, data_config, worker_config
+from zsched.core.values.relay_protocol import SnapshotChunk
+from zsched.link.pipe.frames import encode_chunk
+from zsched.link.sessions.config import client_config, data_config, worker_config
 from zsched.worker import snapshot as worker_snapshot
 from zsched.worker.snapshot import (
     CHUNK,

@@ -10,9 +10,9 @@ import zenoh
 
 from support.sessions import opened
 from support.waiting import free_endpoint, until
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import WorkerLink
-from zsched.errors import ConfigError
-from zsched.sessions.config import client_config, data_config, worker_config
+from zsched.link.sessions.config import client_config, data_config, worker_config
 from zsched.worker.start import open_session
 
 

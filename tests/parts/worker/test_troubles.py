@@ -14,14 +14,14 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.events import FrameDropped
-from zsched.core.relay_protocol import WorkerTrouble
+from zsched.core.values import codec as wire
+from zsched.core.values.events import FrameDropped
 from zsched.core.values.model import MAX_REASON
-from zsched.hop.acknowledger import Acknowledger
+from zsched.core.values.relay_protocol import WorkerTrouble
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import Keyspace
 from zsched.relay.troubles import MAX_SPEAKERS, PAUSE_S, Word
 from zsched.relay.troubles import Troubles as Heard
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import JobBook
 from zsched.worker.keep import Debts

@@ -20,15 +20,15 @@ import zenoh
 from support.hand_relay import INPUT, KEYS, ROLE_KEY, Relay, environment
 from support.signals import signal_another_thread, signal_at_once
 from support.waiting import free_endpoint, until, within
-from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks, WorkerTrouble
+from zsched.core.values import codec as wire
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.errors import ConfigError
-from zsched.guard import guarded
-from zsched.ipc.pipe import encode_end
-from zsched.sessions.config import data_config, worker_config
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks, WorkerTrouble
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded
+from zsched.link.keyspace import END_CHUNK
+from zsched.link.pipe.frames import encode_end
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.worker import Output, Received, Worker
 from zsched.worker import backlog as worker_backlog
 from zsched.worker import inputs as worker_inputs

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 def screen(monkeypatch: pytest.MonkeyPatch) -> int:
     """People look, in so many columns."""
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr("zsched.screen.is_screen", lambda _stream: True)
+    monkeypatch.setattr("zsched.host.screen.is_screen", lambda _stream: True)
     return 80
 
 

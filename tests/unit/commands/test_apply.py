@@ -15,16 +15,16 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands import change as verbs
-from zsched.commands import fleet
-from zsched.commands.ask import PASSES_ON
-from zsched.commands.change import DOCUMENT, InForce, OrderView, in_force
-from zsched.commands.common import CliError
+from zsched.commands.base import change as verbs
+from zsched.commands.act import fleet
+from zsched.commands.base.change import DOCUMENT, InForce, OrderView, in_force
+from zsched.commands.base.ask import PASSES_ON
+from zsched.commands.base.common import CliError
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash
+from zsched.host.operator_socket import OperatorSocket
 
 Json = dict[str, Any]
 TEXT = """\

@@ -13,17 +13,17 @@ from typing import Any
 
 import pytest
 
-from zsched import paths as places
-from zsched.adapters.host.operator_socket import OperatorSocket
-from zsched.commands import ask
-from zsched.commands.ask import AGAIN_S, Door, ask_door, door_of, find_door
-from zsched.commands.change import asker, user_name
-from zsched.commands.common import CliError, Json
+from zsched.commands.base.change import asker, user_name
+from zsched.commands.base import ask
+from zsched.commands.base.ask import AGAIN_S, Door, ask_door, door_of, find_door
+from zsched.commands.base.common import CliError, Json
+from zsched.core.values.errors import AdapterError
+from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.core.values.fleet import Cell
 from zsched.core.values.messages import CommandOutcome, CommandResult
-from zsched.errors import AdapterError
-from zsched.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE
-from zsched.paths import again_path, socket_path
+from zsched.host import paths as places
+from zsched.host.operator_socket import OperatorSocket
+from zsched.host.paths import again_path, socket_path
 
 ENV = {"ZSCHED_NODE": "robot1"}
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from zsched.commands.page import clock_time
-from zsched.commands.report import render_brief, render_status
+from zsched.commands.base.page import clock_time
+from zsched.commands.base.report import render_brief, render_status
 
 RECORDED = Path(__file__).parent / "recorded_status"
 NOON = time.mktime((2026, 3, 4, 12, 0, 0, 0, 0, -1))

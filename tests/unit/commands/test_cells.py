@@ -10,11 +10,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from zsched.cli import app
-from zsched.commands import cells, history
-from zsched.commands.ask import Door
-from zsched.commands.common import CliError
-from zsched.exits import EXIT_UNREACHABLE
-from zsched.runtime.membership import Places, found
+from zsched.commands.base.ask import Door
+from zsched.commands.base.common import CliError
+from zsched.commands.look import cells, history
+from zsched.commands.base.places import Places
+from zsched.commands.members.belongings import found
+from zsched.core.values.exits import EXIT_UNREACHABLE
 
 FILE = """\
 fleet: hall-a

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from zsched import __version__
-from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
 from zsched.commands.completion import script_file
+from zsched.host.operator_socket import OperatorSocket
 
 ROOT = Path(__file__).parents[3]
 RECORDED = Path(__file__).parent / "recorded_status"

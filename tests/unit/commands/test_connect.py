@@ -11,10 +11,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from zsched.cli import app
-from zsched.commands import ask
-from zsched.commands.ask import Door, ask_door, endpoint_of
-from zsched.commands.common import CliError
-from zsched.errors import AdapterError
+from zsched.commands.base import ask
+from zsched.commands.base.ask import Door, ask_door, endpoint_of
+from zsched.commands.base.common import CliError
+from zsched.core.values.errors import AdapterError
 
 
 def run(*arguments: object) -> Result:

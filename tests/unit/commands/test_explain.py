@@ -19,19 +19,19 @@ from support.decisions import figures_of
 from support.equations import total_utility
 from support.fleets import task_of, tuning_of
 from support.schemas import faults
-from zsched.adapters.host.decision_log import NAME, DecisionLog
-from zsched.commands import explain as verb
-from zsched.commands.ask import Door
-from zsched.commands.common import CliError
-from zsched.commands.explain import SCHEMA, explain, formula_of
-from zsched.core.instructions import RecordStory
+from zsched.commands.base.ask import Door
+from zsched.commands.base.common import CliError
+from zsched.commands.look import explain as verb
+from zsched.commands.look.explain import SCHEMA, explain, formula_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Explanation, JudgeMemory, KeptMemory, Move, Need
+from zsched.core.values.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.instructions import RecordStory
 from zsched.core.values.model import ScoreForm, Utility, UtilityVector, Weights
 from zsched.core.values.snapshot import VoteStatus
-from zsched.exits import EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.runtime.desk import answer_json
+from zsched.host.decision_log import NAME, DecisionLog
+from zsched.link.requests import answer_json
 
 ROBOTS = ("robot1", "robot2", "robot3")
 TUNING = tuning_of(cpu=0.5, memory=0.3, network=0.2, bonus=0.05)
@@ -115,11 +115,12 @@ def test_a_daemon_that_tells_no_sums_gets_the_same_page(fleet: Fleet, capsys: py
 
 def test_verbs_that_only_show_load_no_values_and_no_scheduler() -> None:
     """The values alone take a quarter of the verb's time, the scheduler as long as the whole of it."""
-    verbs = "zsched.commands.status, zsched.commands.report, zsched.commands.history, zsched.commands.explain"
+    look = "zsched.commands.look"
+    verbs = f"{look}.status, zsched.commands.base.report, {look}.history, {look}.explain"
     code = f"import sys, zsched.cli, {verbs}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     heavy = ("zsched.core.values.model", "zsched.core.scheduler", "zsched.wire", "msgpack", "zenoh")
-    assert "zsched.commands.explain" in loaded
+    assert "zsched.commands.look.explain" in loaded
     assert [one for one in loaded if one.startswith(heavy)] == []
 
 
@@ -313,7 +314,7 @@ def test_a_robot_that_is_none_is_refused_with_the_nearest() -> None:
 def past(fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
     """A log of two moves: at 1000 s and at 2000 s of the wall clock, each 1 s after its judgement."""
     moments = iter([999.0, 999.5, 1000.0, 1500.0, 1999.0, 2000.0, 2050.0, 2060.0])
-    monkeypatch.setattr("zsched.adapters.host.decision_log.wall_s", lambda: next(moments, 2100.0))
+    monkeypatch.setattr("zsched.host.decision_log.wall_s", lambda: next(moments, 2100.0))
     fleet.log = DecisionLog(tmp_path, "robot1", 7, lambda _problem: None)
     fleet.log.start()
 

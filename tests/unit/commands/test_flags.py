@@ -14,12 +14,12 @@ from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
-from zsched.commands import flags as verbs
-from zsched.commands.ask import Door
-from zsched.commands.change import OrderView
-from zsched.commands.report import render_brief, render_status
+from zsched.commands.act import flags as verbs
+from zsched.commands.base.change import OrderView
+from zsched.commands.base.ask import Door
+from zsched.commands.base.report import render_brief, render_status
+from zsched.host.operator_client import Json
 
 TEXT = "fleet: lab\n"
 TWO_NODES = """\
@@ -104,7 +104,7 @@ class Daemon:
 
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    monkeypatch.setattr("zsched.commands.change.PAUSE_S", 0.001)
+    monkeypatch.setattr("zsched.commands.base.change.PAUSE_S", 0.001)
     running = Daemon()
     with answering(running.answer, tmp_path, monkeypatch):
         yield running

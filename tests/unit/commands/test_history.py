@@ -14,20 +14,20 @@ from typer.testing import CliRunner
 from support.decisions import figures_of
 from support.fleets import task_of, tuning_of
 from support.schemas import faults
-from zsched.adapters.host.decision_log import NAME, DecisionLog
 from zsched.cli import app
-from zsched.commands import history as verb
-from zsched.commands import history as verbs
-from zsched.commands.ask import Door
-from zsched.commands.common import CliError
-from zsched.commands.history import subject_of, types_of
-from zsched.commands.page import duration_s
-from zsched.core.instructions import RecordStory
+from zsched.commands.base.ask import Door
+from zsched.commands.base.common import CliError
+from zsched.commands.base.page import duration_s
+from zsched.commands.look import history as verb
+from zsched.commands.look import history as verbs
+from zsched.commands.look.history import subject_of, types_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Move
+from zsched.core.values.exits import EXIT_UNREACHABLE, EXIT_USAGE
 from zsched.core.values.fleet import Cell, WorkerSpec
+from zsched.core.values.instructions import RecordStory
 from zsched.core.values.model import Utility, UtilityVector
-from zsched.exits import EXIT_UNREACHABLE, EXIT_USAGE
+from zsched.host.decision_log import NAME, DecisionLog
 
 NOW = 1_790_000_000.0
 HERE = Door(socket=Path("s"))
@@ -102,7 +102,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> Pages:
         entry("learnt \x1b[2J", 60.0, task="other", move={**MOVE, "left": None, "votes": []}),
     )
     monkeypatch.setattr(verb, "ask_door", made.ask)
-    monkeypatch.setattr("zsched.commands.history.time.sleep", lambda _s: None)
+    monkeypatch.setattr("zsched.commands.look.history.time.sleep", lambda _s: None)
     return made
 
 
@@ -286,7 +286,7 @@ def test_who_follows_goes_on_where_it_was_and_outlasts_a_restart(
         if step == "end":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("zsched.commands.history.time.sleep", sleep)
+    monkeypatch.setattr("zsched.commands.look.history.time.sleep", sleep)
     assert events(HERE, is_following=True) == 0
     captured = capsys.readouterr()
     assert captured.out.count("learnt") == 2

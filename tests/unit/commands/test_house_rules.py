@@ -17,8 +17,8 @@ import typer.core
 from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
-from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
+from zsched.host.operator_client import Json
 
 DOCUMENT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 CLI_PAGE = (Path(__file__).parents[3] / "docs" / "guide" / "cli.md").read_text()
@@ -165,7 +165,7 @@ class Daemon:
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
     running = Daemon(tmp_path)
-    monkeypatch.setattr("zsched.commands.change.IN_FORCE_S", 0.2)  # its document stays the one that it has
+    monkeypatch.setattr("zsched.commands.base.change.IN_FORCE_S", 0.2)  # its document stays the one that it has
     with answering(running.answer, tmp_path, monkeypatch):
         yield running
 

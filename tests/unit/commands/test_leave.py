@@ -16,15 +16,15 @@ from typer.testing import CliRunner, Result
 from support.authorities import make_authority
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import Json, OperatorSocket
-from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
-from zsched.commands import leave
-from zsched.commands.renewing import UNIT_FOLDER
+from zsched.commands.base.renewing import UNIT_FOLDER
+from zsched.commands.members import leave
 from zsched.config.load import load_fleet
+from zsched.core.values.codec import as_plain
 from zsched.core.values.electorate import Elector
 from zsched.core.vote.generations import blank_state
-from zsched.wire.codec import as_plain
+from zsched.host.operator_socket import Json, OperatorSocket
+from zsched.host.state_file import StateFile
 
 STATUS = json.loads((Path(__file__).parent / "recorded_status" / "healthy.json").read_text())
 TEXT = """\
@@ -151,7 +151,7 @@ def hall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hall]:
     monkeypatch.delenv("ZSCHED_NODE", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.delenv("ZSCHED_AUTHORITY", raising=False)
-    monkeypatch.setattr("zsched.commands.change.PAUSE_S", 0.001)
+    monkeypatch.setattr("zsched.commands.base.change.PAUSE_S", 0.001)
     (tmp_path / "fleet.yaml").write_text(TEXT)
     fleet = load_fleet(tmp_path / "fleet.yaml")
     state = blank_state(fleet, "robot3", 0, None, incarnation=1, hardware="", disk="01")

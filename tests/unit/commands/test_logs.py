@@ -120,8 +120,8 @@ def test_logs_followed_go_along_with_the_task_to_its_next_owner(
             printed_by["edge2"].append({"number": 9, "age_s": 0.0, "text": "on"})
 
     monkeypatch.setattr(daemon._socket, "_answer", answer)
-    monkeypatch.setattr("zsched.commands.logs.OWNER_S", 0.0)
-    monkeypatch.setattr("zsched.commands.logs.time", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr("zsched.commands.look.logs.OWNER_S", 0.0)
+    monkeypatch.setattr("zsched.commands.look.logs.time", SimpleNamespace(sleep=sleep))
     for named, expected in (((), ["one", "last words", "go", "on"]), (("edge1",), ["one", "last words"])):
         daemon.status["tasks"][0]["owner"] = "edge1"
         printed_by["edge1"], printed_by["edge2"] = printed_by["edge1"][:1], printed_by["edge2"][:2]
@@ -143,7 +143,7 @@ def test_logs_followed_says_once_that_nobody_answers(daemon: Daemon, monkeypatch
             raise KeyboardInterrupt
         daemon.is_here = step == "back"
 
-    monkeypatch.setattr("zsched.commands.logs.time", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr("zsched.commands.look.logs.time", SimpleNamespace(sleep=sleep))
     result = run("logs", "echo", "-f")
     assert result.exit_code == 0
     assert result.stderr.count("asking again") == 2

@@ -25,31 +25,32 @@ from typer.testing import CliRunner, Result
 
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
-from zsched.adapters.host import state_file
-from zsched.adapters.host.operator_socket import OperatorSocket
-from zsched.adapters.host.state_file import StateFile
 from zsched.cli import app
-from zsched.commands import membership, papers
-from zsched.commands.common import CliError
-from zsched.commands.membership import Address, address_of, dial_order, how_to_start, own_address
-from zsched.commands.renewing import UNIT_FOLDER, renew_advice
+from zsched.commands.base.common import CliError
+from zsched.commands.base.renewing import UNIT_FOLDER, renew_advice
+from zsched.commands.members import belongings as membership_files
+from zsched.commands.members import membership, papers
+from zsched.commands.base.places import Places
+from zsched.commands.members.membership import Address, address_of, dial_order, how_to_start, own_address
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
+from zsched.core.values.codec import as_plain, document_hash, from_plain
 from zsched.core.values.document import Document, Rollout, Text
+from zsched.core.values.errors import ConfigError
+from zsched.core.values.exits import EXIT_WOULD_CHANGE
 from zsched.core.values.fleet import fleet_hash
 from zsched.core.values.struct import replace
-from zsched.errors import ConfigError
-from zsched.exits import EXIT_WOULD_CHANGE
+from zsched.host.document_store import copied_file
+from zsched.host import state_file
+from zsched.host.operator_socket import OperatorSocket
+from zsched.host.state_file import StateFile
+from zsched.link.invitation import decode_invitation, encode_invitation
+from zsched.link.sessions.certificate import common_names
+from zsched.link.sessions.secured import require_own
 from zsched.pki.authority import create, opened
 from zsched.pki.certificates import is_key_of
-from zsched.runtime import membership as membership_files
 from zsched.runtime.library import Library
-from zsched.runtime.membership import Places
 from zsched.runtime.restoring import read_stored
-from zsched.runtime.secured import require_own
-from zsched.sessions.certificate import common_names
-from zsched.wire.codec import as_plain, document_hash, from_plain
-from zsched.wire.invitation import decode_invitation, encode_invitation
 
 Json = dict[str, Any]
 TEXT = """\
@@ -278,7 +279,7 @@ def test_what_the_timer_needs_to_renew_by_an_authority_is_said_when_it_is_made(
             f"else `{shlex.join(('zsched', 'pki', 'renew', '--deliver', '--authority', str(folder)))}` there"
         )
         assert "LoadCredential" not in said
-    monkeypatch.setattr("zsched.commands.renewing.UNSEEN", ("/home",))
+    monkeypatch.setattr("zsched.commands.base.renewing.UNSEEN", ("/home",))
     result = run(*words, "--authority", tmp_path / "100%", "--passphrase", *here(tmp_path / "3"), stdin="s\ns\n")
     (said,) = [line for line in result.stdout.splitlines() if "certificates last 30 days: " in line]
     text = "\n".join(re.findall(r"`([^`]*)`", said.partition("with the lines ")[2].partition(";")[0])) + "\n"
@@ -326,7 +327,7 @@ def test_a_creation_that_a_power_cut_broke_off_leaves_no_authority_in_the_way(
         raise PowerCut
 
     words = ("fleet", "create", "hall", "--node", "robot1", "--address", "127.0.0.1", *here(tmp_path))
-    for place in ("zsched.pki.authority.Authority.issue", "zsched.runtime.membership._put_papers"):
+    for place in ("zsched.pki.authority.Authority.issue", "zsched.commands.members.belongings._put_papers"):
         with monkeypatch.context() as patch:
             patch.setattr(place, cut)
             with pytest.raises(PowerCut):
@@ -394,7 +395,7 @@ def test_ctrl_c_at_the_question_for_the_passphrase_founds_nothing(
             raise typer.Abort from None
         return "typed"
 
-    monkeypatch.setattr("zsched.commands.pki.typer.prompt", asked)
+    monkeypatch.setattr("zsched.commands.members.pki.typer.prompt", asked)
     words = ("--address", "127.0.0.1", "--passphrase")
     result = run("fleet", "create", "hall", "--node", "robot1", *words, *here(tmp_path))
     assert result.exit_code == 1
@@ -802,7 +803,7 @@ def test_a_later_invitation_that_cannot_be_used_leaves_the_machine_the_node_that
     _, second, folder = invited_twice(tmp_path, node)
     before = sorted(str(path) for path in folder.rglob("*"))
     moment = int((datetime.now(UTC) - timedelta(days=400)).timestamp() * 1e9)
-    monkeypatch.setattr("zsched.runtime.membership.wall_ns", lambda: moment)
+    monkeypatch.setattr("zsched.commands.members.belongings.wall_ns", lambda: moment)
     for more in (("--plan",), ()):
         refused = run("join", second, *more, *here(folder))
         assert (refused.exit_code, "and this machine's clock says" in refused.stderr) == (78, True)
@@ -963,7 +964,7 @@ def test_a_later_key_is_taken_though_the_power_goes_at_any_step_and_the_state_st
     assert common_names(certificate) == ("robot2.k2.hall.zsched.internal",)
     assert is_key_of((folder / "pki" / "key.pem").read_bytes(), certificate)
     lets_in(folder)
-    assert membership_files.copied_file(folder / "state") == fleet_hash(load_fleet(folder / "fleet.yaml"))
+    assert copied_file(folder / "state") == fleet_hash(load_fleet(folder / "fleet.yaml"))
     assert (folder / "state" / "state").read_bytes() == state
     assert "nothing to do" in run("join", second, *here(folder)).stdout
 
@@ -1115,7 +1116,7 @@ def test_an_invitation_whose_parts_do_not_go_together_changes_nothing(
     file.write_text(encode_invitation(whole))
     for later, then in ((timedelta(days=31), "31 days later"), (timedelta(days=-2), "before it was made")):
         moment = int((datetime.now(UTC) + later).timestamp() * 1e9)
-        monkeypatch.setattr("zsched.runtime.membership.wall_ns", lambda moment=moment: moment)
+        monkeypatch.setattr("zsched.commands.members.belongings.wall_ns", lambda moment=moment: moment)
         done = run("join", file, *here(folder))
         assert done.exit_code == 78, then
         assert "and this machine's clock says" in done.stderr

@@ -13,13 +13,13 @@ from typer.testing import CliRunner, Result
 
 from support.doors import STATUS, answering, living
 from support.schemas import faults
-from zsched.adapters.host.operator_client import Json
 from zsched.cli import app
-from zsched.commands.change import user_name
-from zsched.commands.common import CliError
-from zsched.commands.report import render_brief, render_status
-from zsched.commands.tune import KEYS, tuned
+from zsched.commands.base.change import user_name
+from zsched.commands.act.tune import KEYS, tuned
+from zsched.commands.base.common import CliError
+from zsched.commands.base.report import render_brief, render_status
 from zsched.core.values.words import CREATION_STEP
+from zsched.host.operator_client import Json
 
 TUNING: Json = {
     "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
@@ -152,7 +152,7 @@ def test_an_order_that_is_given_again_changes_nothing_but_for_another_reason_or_
         ("bob", (), 4, "lens"),
         ("bob", ("-m", "fan"), 5, "fan"),
     ):
-        monkeypatch.setattr("zsched.commands.change.user_name", lambda user=user: user)
+        monkeypatch.setattr("zsched.commands.base.change.user_name", lambda user=user: user)
         before = len(daemon.orders)
         said = run(*words, *more, "--yes").stdout
         assert ("Nothing would change." in said) is (before == orders)
@@ -187,7 +187,7 @@ def test_a_pause_that_some_node_never_learns_says_which(daemon: Daemon, monkeypa
         return {**told, "tasks": [{**one, "revision": 7} for one in told["tasks"]]} if is_late else told
 
     daemon.answers = answer
-    monkeypatch.setattr("zsched.commands.hold.KNOWN_S", 0.1)
+    monkeypatch.setattr("zsched.commands.act.hold.KNOWN_S", 0.1)
     for _ in range(2):  # given again it changes nothing, and edge2 still has not learnt it
         result = run("pause", "echo", "--wait", "--yes")
         assert result.exit_code == 5, result.output
@@ -242,7 +242,7 @@ def test_what_was_agreed_is_told_though_the_daemon_is_silent_afterwards(
         return {"error": "the decision loop of robot1 did not answer within 3 s"} if is_silent else told
 
     daemon.answers = answer
-    monkeypatch.setattr("zsched.commands.hold.KNOWN_S", 0.3)
+    monkeypatch.setattr("zsched.commands.act.hold.KNOWN_S", 0.3)
     result = run("pause", "echo", "--yes")
     assert (result.exit_code, result.stdout.splitlines()[-1]) == (0, "echo: agreed (revision 8)"), result.output
     daemon.orders.clear()
@@ -313,7 +313,7 @@ def test_a_move_waits_for_the_profile_of_a_node_that_lives(daemon: Daemon, monke
     daemon.answers = answer
     assert run("move", "echo", "edge2", "--plan").exit_code == 10
     looks.clear()
-    monkeypatch.setattr("zsched.commands.move.KNOWN_S", 0.0)
+    monkeypatch.setattr("zsched.commands.act.move.KNOWN_S", 0.0)
     result = run("move", "echo", "edge2", "--yes")
     assert (result.exit_code, len(looks)) == (1, 1)
     assert "no fresh profile" in result.stderr

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from support.schemas import faults
-from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.sessions.certificate import common_names
+from zsched.host.operator_socket import OperatorSocket
+from zsched.link.sessions.certificate import common_names
 
 Json = dict[str, Any]
 FLEET = """\

@@ -15,7 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from ruamel.yaml import YAML
 
-from zsched.commands.metrics import metrics_text
+from zsched.tools.metrics import metrics_text
 
 ROOT = Path(__file__).parents[3]
 RULES = ROOT / "configs" / "prometheus" / "zsched.rules.yml"

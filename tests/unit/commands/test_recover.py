@@ -10,22 +10,22 @@ from typing import Any
 
 import pytest
 
-from zsched.adapters.host import decision_log
-from zsched.adapters.host.state_file import StateFile
-from zsched.commands.ask import Door
-from zsched.commands.change import OrderView
-from zsched.commands.common import CliError, Json
-from zsched.commands.history import changes_of
-from zsched.commands.init import Place
-from zsched.commands.recover import begin_generation as recover
-from zsched.commands.recover import rejoin_side as rejoin
+from zsched.commands.base.change import OrderView
+from zsched.commands.base.ask import Door
+from zsched.commands.base.common import CliError, Json
+from zsched.commands.look.history import changes_of
+from zsched.commands.members import recovery
+from zsched.commands.members.blank import Heard, init_state
+from zsched.commands.members.init import Place
+from zsched.commands.members.recover import begin_generation as recover
+from zsched.commands.members.recover import rejoin_side as rejoin
 from zsched.config.load import load_fleet
 from zsched.core.values.durable import DurableState
+from zsched.core.values.errors import AdapterError
+from zsched.core.values.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
-from zsched.errors import AdapterError
-from zsched.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE, EXIT_WOULD_CHANGE
-from zsched.runtime import recovery
-from zsched.runtime.init import Heard, init_state
+from zsched.host import decision_log
+from zsched.host.state_file import StateFile
 
 TEXT = """\
 fleet: hall

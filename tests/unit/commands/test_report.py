@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 
 from support.fleets import tuning_of
-from zsched.commands.page import Page, cut, memory, size, span
-from zsched.commands.report import all_problems, degradations, render_status
-from zsched.core.report import snapshot_json
+from zsched.commands.base.page import Page, cut, memory, size, span
+from zsched.commands.base.report import all_problems, degradations, render_status
 from zsched.core.values.model import Utility
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import Link, LinkSource, WorkerLoad, WorkerState
+from zsched.core.values.report import snapshot_json
 from zsched.core.values.snapshot import (
     DecisionStatus,
     NodeStatus,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import task_of, tuning_of
-from zsched.commands.check import told
+from zsched.commands.look.check import told
 from zsched.config.schema import LINK_LIMITS, SCHEDULING
 from zsched.core.scheduler.ledger import left_after_s
 from zsched.core.values.fleet import LinkLimits, TaskSpec, Timing

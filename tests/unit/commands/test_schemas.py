@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.common import SCHEMAS, known_majors, schema_of
+from zsched.commands.base.common import SCHEMAS, known_majors, schema_of
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import Jobs, WorkerLoad
 from zsched.core.values.snapshot import DecisionStatus, NodeStatus, QuorumStatus, Snapshot, TaskStatus, VoteStatus

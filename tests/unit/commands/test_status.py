@@ -20,11 +20,11 @@ from typer.testing import CliRunner, Result
 from support.recorded_daemon import Daemon
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands import ask
-from zsched.commands.ask import ask_door, find_door
-from zsched.commands.common import CliError
-from zsched.commands.report import render_status
-from zsched.commands.status import _fitted
+from zsched.commands.base import ask
+from zsched.commands.base.ask import ask_door, find_door
+from zsched.commands.base.common import CliError
+from zsched.commands.base.report import render_status
+from zsched.commands.look.status import _fitted
 from zsched.core.values.fleet import MOST_ORDER_S
 
 CLI = (sys.executable, "-m", "zsched.cli")

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from zsched.commands.common import stopped_by_signal
+from zsched.commands.base.common import stopped_by_signal
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -24,7 +24,7 @@ def test_a_signal_sets_a_latch_and_does_what_it_did_again(number: signal.Signals
 
 STORM = """
 import signal, time
-from zsched.commands.common import stopped_by_signal
+from zsched.commands.base.common import stopped_by_signal
 until_s = time.monotonic() + 2.0
 while time.monotonic() < until_s:
     with stopped_by_signal() as stop:

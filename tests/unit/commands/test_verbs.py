@@ -17,13 +17,13 @@ from typer.testing import CliRunner, Result
 
 from support.authorities import install, make_authority
 from zsched import __version__
-from zsched.adapters.machine import core_speed
-from zsched.adapters.network.node_ping import Pinged
 from zsched.cli import app
-from zsched.commands.common import say
-from zsched.commands.ping import Question, Way, _lines, _ways
+from zsched.commands.base.common import say
+from zsched.commands.look.ping import Question, Way, _lines, _ways
 from zsched.config.load import load_fleet
 from zsched.core.values.fleet import fleet_hash
+from zsched.host.machine import core_speed
+from zsched.link.bus.node_ping import Pinged
 
 REPOSITORY = Path(__file__).parents[3]
 RECORDED = Path(__file__).parent / "recorded_status"
@@ -472,7 +472,7 @@ def test_ctrl_c_ends_a_ping_that_waits_for_answers(tmp_path: Path, monkeypatch: 
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("zsched.commands.ping.measure", ask)
+    monkeypatch.setattr("zsched.commands.look.ping.measure", ask)
     (tmp_path / "fleet.yaml").write_text(FLEET)
     fleet = load_fleet(tmp_path / "fleet.yaml")
     before = signal.signal(signal.SIGALRM, interrupt)

@@ -16,10 +16,10 @@ from typer.testing import CliRunner, Result
 
 from support.schemas import faults
 from support.waiting import until, within
-from zsched.adapters.host.operator_socket import OperatorSocket
 from zsched.cli import app
-from zsched.commands.common import CliError
-from zsched.commands.wait import Condition, missing, parse_condition
+from zsched.commands.base.common import CliError
+from zsched.commands.look.wait import Condition, missing, parse_condition
+from zsched.host.operator_socket import OperatorSocket
 
 RECORDED = Path(__file__).parent / "recorded_status"
 Json = dict[str, Any]

@@ -19,10 +19,10 @@ from typer.testing import CliRunner, Result
 
 from support.clinic import fleet_scene
 from support.doors import STATUS, answering
-from zsched.adapters.host.decision_log import NAME
 from zsched.cli import app
-from zsched.commands.bugreport import gathered
-from zsched.screen import harmless
+from zsched.host.decision_log import NAME
+from zsched.host.screen import harmless
+from zsched.tools.bugreport import gathered
 
 Json = dict[str, Any]
 EVIL = "\x1b[2J\x9b31m\r\nFORGED line\u202e"

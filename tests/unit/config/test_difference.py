@@ -15,9 +15,9 @@ from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Cell, Fleet, LinkSpec, LocalSide, NodeSpec, TaskSpec
 from zsched.core.values.model import NodeKind, Weights
 from zsched.core.values.profile import LinkSource
-from zsched.runtime.restarts import opens_anew, restarts
-from zsched.sessions.comparison import lacking
-from zsched.sessions.config import worker_config
+from zsched.host.workers.comparison import lacking
+from zsched.link.sessions.config import worker_config
+from zsched.link.sessions.restarts import opens_anew, restarts
 
 TEXT = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 RULES = "tasks.map_merge.scheduling"

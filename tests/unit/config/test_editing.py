@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from zsched.config.editing import add_entries, add_names, is_list, remove_node, remove_task
 from zsched.config.load import check_bytes
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import Fleet
-from zsched.errors import ConfigError
 
 ANNOTATED = (Path(__file__).parents[3] / "configs" / "fleet.yaml").read_text()
 FRAGMENT = """\

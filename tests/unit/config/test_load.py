@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from zsched.config.load import CheckResult, check_bytes, check_file, load_fleet
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     Fleet,
@@ -22,7 +23,6 @@ from zsched.core.values.fleet import (
 from zsched.core.values.model import Aggregate, NodeKind, Objective, PairReading, Reach, ScoreForm
 from zsched.core.values.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.core.values.profile import LinkSource
-from zsched.errors import ConfigError
 
 ROOT = Path(__file__).parents[3]
 CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))

@@ -19,13 +19,13 @@ from support.decisions import figures_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of
 from support.proposals import proposal_of
-from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.decision import decide
 from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights

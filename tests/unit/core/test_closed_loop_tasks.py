@@ -16,7 +16,6 @@ from support.allocations import allocation_of
 from support.decisions import figures_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of
-from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.decision import decide
@@ -24,6 +23,7 @@ from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import Judge, Judgement, Outcome
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.usage import book
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.fleet import DEFAULT_BONUS, Demand, Timing
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Weights

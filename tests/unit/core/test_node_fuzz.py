@@ -11,12 +11,12 @@ import pytest
 from support.beats import beat_of
 from support.states import state_of
 from support.storm import EDGES, ELECTORATE, FLEET, ROBOTS, Storm
-from zsched.core import events as ev
-from zsched.core import instructions as do
-from zsched.core.node import Node
-from zsched.core.report import snapshot_json
-from zsched.core.status import build_snapshot, status_line
-from zsched.wire import codec as wire
+from zsched.core.node.node import Node
+from zsched.core.node.status import build_snapshot, status_line
+from zsched.core.values import codec as wire
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
+from zsched.core.values.report import snapshot_json
 
 
 def make(me: str, *, has_state: bool = True) -> Node:

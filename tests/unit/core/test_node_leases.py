@@ -11,10 +11,10 @@ from support.allocations import allocation_of
 from support.beats import beat_of, hear
 from support.fleets import fleet_of, task_of
 from support.states import state_of
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.executor.handover import LEAVES_S
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Grant
 from zsched.core.values.fleet import WorkerSpec, lease_terms
 from zsched.core.values.messages import Learnt

@@ -17,10 +17,10 @@ from support.ballots import ballot_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.slices import slices
 from support.states import state_of
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.executor.handover import Phase
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.durable import DurableState
 from zsched.core.values.fleet import Fleet, WorkerSpec, electorate_hash
 from zsched.core.values.lease import hold_s

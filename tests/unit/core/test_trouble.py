@@ -16,16 +16,16 @@ from support.clinic import answer, run, scene_of
 from support.fleets import fleet_of, task_of
 from support.profiles import load_of, profile_of
 from support.states import state_of
-from zsched.commands.report import degradations, render_status
-from zsched.core import events as ev
-from zsched.core.node import Node
-from zsched.core.report import snapshot_json
-from zsched.core.status import build_snapshot
+from zsched.commands.base.report import degradations, render_status
+from zsched.core.node.node import Node
+from zsched.core.node.status import build_snapshot
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import WorkerSpec, electorate_hash
 from zsched.core.values.messages import Learnt
 from zsched.core.values.profile import WorkerLoad, WorkerState, with_troubles
+from zsched.core.values.report import snapshot_json
 from zsched.core.values.words import Trouble
-from zsched.doctor.model import Scene
+from zsched.tools.doctor.model import Scene
 
 ROBOTS, EDGES = ("robot1", "robot2", "robot3"), ("edge1", "edge2")
 FLEET = fleet_of(

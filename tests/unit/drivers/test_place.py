@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from zsched.core.values.errors import ConfigError
 from zsched.drivers.place import Place
-from zsched.errors import ConfigError
 from zsched.runtime.sampler import noted_pid
 
 

@@ -13,10 +13,10 @@ import zenoh
 
 from support.clocks import Clocks
 from zsched.core.route.lifecycle import State, Transition
+from zsched.core.values.errors import ConfigError
 from zsched.drivers.place import Place
 from zsched.drivers.ros2_lifecycle import LifecycleNode, as_client, fault_of, look
-from zsched.errors import ConfigError
-from zsched.sessions.config import worker_config
+from zsched.link.sessions.config import worker_config
 
 
 def node(tmp_path: Path, domain: str = "0") -> LifecycleNode:

@@ -22,11 +22,11 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsched.core.values.certificates import Role
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
+from zsched.host.key_files import write_whole
 from zsched.pki import authority as module
 from zsched.pki import certificates as made
 from zsched.pki.authority import RECORD, TRUSTED, Authority, create, key_name, opened
-from zsched.pki.files import write_whole
 
 NOW = datetime(2026, 11, 23, 12, tzinfo=UTC)
 FLEET = "yard"

@@ -9,12 +9,12 @@ import pytest
 
 from support.threads import no_threads
 from support.waiting import until
-from zsched.core.relay_protocol import WorkerMatched, WorkerWatch
 from zsched.core.values.plan import Direction, RosGraph, Route, StreamSettings
+from zsched.core.values.relay_protocol import WorkerMatched, WorkerWatch
+from zsched.link.sessions.stalled_links import StalledLinks
 from zsched.relay.graph import GraphMirror
 from zsched.relay.matching import Matching
 from zsched.relay.streams.history import MAX_ASKERS, HeldValues
-from zsched.sessions.stalled_links import StalledLinks
 
 ROS = Route(
     stream="t/in/0",

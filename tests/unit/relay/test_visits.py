@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from support.clocks import Clocks
-from zsched.ipc.pipe import write_frame
-from zsched.ipc.protocol import RelayHello
-from zsched.ipc.relay_socket import PROTOCOL
+from zsched.core.values import codec as wire
+from zsched.link.pipe.frames import write_frame
+from zsched.link.pipe.protocol import RelayHello
+from zsched.link.pipe.relay_socket import PROTOCOL
 from zsched.relay import visits as relay_visits
 from zsched.relay.visits import Visits
-from zsched.wire import codec as wire
 
 
 @pytest.fixture

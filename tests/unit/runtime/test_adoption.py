@@ -10,20 +10,20 @@ from unittest.mock import Mock
 import pytest
 
 from support.fleets import fleet_of, task_of
-from zsched.adapters.network.control_bus import ControlBus
-from zsched.adapters.network.limits import limit_for
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core import instructions as do
-from zsched.core.relay_protocol import TaskEnded, WorkerWatch
+from zsched.core.values import instructions as do
 from zsched.core.values.certificates import Holder
 from zsched.core.values.fleet import Fleet, Security, StreamRule, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.plan import Direction, ReadyWhen
-from zsched.ipc.protocol import RelayHello
-from zsched.ipc.relay_socket import PROTOCOL
+from zsched.core.values.relay_protocol import TaskEnded, WorkerWatch
+from zsched.link.bus.control_bus import ControlBus
+from zsched.link.bus.limits import limit_for
+from zsched.link.pipe.protocol import RelayHello
+from zsched.link.pipe.relay_socket import PROTOCOL
+from zsched.link.sessions.endpoints import endpoints_for
 from zsched.runtime.adoption import Adoption
-from zsched.runtime.endpoints import endpoints_for
 from zsched.runtime.inbox import Inbox
+from zsched.runtime.relay.streams import RelayHandle
 from zsched.runtime.shell import Shell
 
 SECURITY = Security(folder="pki")

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.document_store import DocumentStore
-from zsched.core import events as ev
-from zsched.core import instructions as do
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
+from zsched.core.values.codec import document_hash, encode
 from zsched.core.values.document import Document, Flag, FlagKind, Text
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import NodeId
-from zsched.errors import ConfigError
+from zsched.host.document_store import DocumentStore
 from zsched.runtime.library import RECENT, Library
-from zsched.wire.codec import document_hash, encode
 
 FILE = """
 fleet: lab

@@ -12,11 +12,12 @@ import pytest
 import zenoh
 
 from support.fleets import fleet_of, task_of
-from zsched.adapters.workers.hired import FOLDER
+from zsched.config.drivers import starter_for
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.fleet import Security, WorkerLink, WorkerSpec
-from zsched.errors import AdapterError
+from zsched.host.workers.hired import FOLDER
 from zsched.runtime import recipes as recipes_module
-from zsched.runtime.recipes import Recipes, starter_for
+from zsched.runtime.recipes import Recipes
 from zsched.runtime.sessions import SessionsRead
 
 HERE, THERE = ("tcp/127.0.0.1:7458",), ("tcp/127.0.0.1:7458", "tcp/192.0.2.1:7458")

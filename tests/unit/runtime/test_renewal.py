@@ -12,9 +12,9 @@ from support.authorities import install, make_authority
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import CommandOutcome
+from zsched.link.sessions.secured import digest_of, files_of, renewed_in, require_own
 from zsched.pki.authority import Authority
 from zsched.runtime.renewal import problem, take
-from zsched.runtime.secured import digest_of, files_of, renewed_in, require_own
 
 OK, UNCHANGED, INVALID = CommandOutcome.OK, CommandOutcome.UNCHANGED, CommandOutcome.INVALID
 NOW = datetime.now(UTC)

@@ -9,9 +9,9 @@ import pytest
 
 from support.fleets import fleet_of
 from support.states import state_of
-from zsched.adapters.host.state_file import LIFE_NAME, StateFile
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.fleet import electorate_hash
-from zsched.errors import AdapterError
+from zsched.host.state_file import LIFE_NAME, StateFile
 from zsched.runtime import restoring
 from zsched.runtime.restoring import Restored, restore
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from random import Random
 
 from support.fleets import fleet_of, task_of
-from zsched.core import events as ev
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Security, electorate_hash
-from zsched.runtime.endpoints import Endpoints
+from zsched.link.sessions.endpoints import Endpoints
 from zsched.runtime.session_watch import SESSIONS, SessionWatch
 
 NOWHERE = Endpoints(

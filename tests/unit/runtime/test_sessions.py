@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from zsched.host.workers.comparison import OTHER_SETTINGS, lacking
+from zsched.link.sessions.config import worker_config
 from zsched.runtime.sessions import NAME, SessionsRead
-from zsched.sessions.comparison import OTHER_SETTINGS, lacking
-from zsched.sessions.config import worker_config
 
 ONE, TWO = "tcp/10.0.0.1:7458", "tcp/10.0.0.2:7458"
 

@@ -19,15 +19,15 @@ from support.fleets import EDGES, ROBOTS, fleet_of, task_of
 from support.profiles import SAMPLE, load_of, profile_of
 from support.states import state_of
 from zsched import daemon
-from zsched.clock import SleepWatch
 from zsched.config.timing import WIRED
-from zsched.core import events as ev
-from zsched.core import instructions as do
-from zsched.core.node import Node
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.fleet import Fleet, lease_terms
 from zsched.core.values.messages import Learnt, MoveTask, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Asked, RegisterState
 from zsched.core.values.struct import replace
+from zsched.host.clock import SleepWatch
 from zsched.runtime.inbox import Inbox
 
 STALL_S = 1.6

@@ -7,8 +7,8 @@ from typing import Any, cast
 
 from zsched.core.hop.held import MAX_HELD
 from zsched.core.hop.shared import STALLED_S, SharedSender
-from zsched.core.relay_protocol import StreamAck
-from zsched.hop.acknowledger import Acknowledger
+from zsched.core.values.relay_protocol import StreamAck
+from zsched.link.acknowledger import Acknowledger
 from zsched.worker.keep import Debts, KeptLane
 
 OWN, OTHER = "aa1", "bb2"

@@ -12,8 +12,8 @@ import pytest
 import zenoh
 
 from support.waiting import until
-from zsched.core.relay_protocol import EndMarker
-from zsched.hop.acknowledger import Acknowledger
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.link.acknowledger import Acknowledger
 from zsched.worker import inputs as worker_inputs
 from zsched.worker.inputs import Dispatcher
 from zsched.worker.jobs import JobBook

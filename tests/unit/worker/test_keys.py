@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.model import MAX_REASON
-from zsched.errors import ConfigError
 from zsched.worker.keys import IN_OUTPUTS, filled, output_keys, untaken
 
 

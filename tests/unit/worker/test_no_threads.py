@@ -16,7 +16,7 @@ from zsched.worker.snapshot import MAX_WAITING, Offer, StateBook
 from zsched.worker.troubles import Troubles
 
 if TYPE_CHECKING:
-    from zsched.core.events import WorkerJobs
+    from zsched.core.values.events import WorkerJobs
 
 
 def test_failures_are_told_of_later() -> None:

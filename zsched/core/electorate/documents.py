@@ -14,14 +14,14 @@ import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from zsched.core import instructions as do
-from zsched.core.events import DocumentRefused
-from zsched.core.todo import ToDo
+from zsched.core.values import instructions as do
 from zsched.core.values.document import Flag, Rollout
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.events import DocumentRefused
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId
 from zsched.core.values.problems import Problem
+from zsched.core.values.todo import ToDo
 
 FETCH_EVERY_S = 3.0
 """A document that no peer has sent is asked for again after this time."""

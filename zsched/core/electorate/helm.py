@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.pilot import Course, Pilot, Word
-from zsched.core.todo import ToDo
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat
 from zsched.core.values.document import Flag, FlagKind
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.fleet import Fleet, Timing
 from zsched.core.values.model import NodeId
+from zsched.core.values.todo import ToDo
 
 STAGGER_BALLOTS = 2
 """Each elector proposes a change of the electors so many times ``ballot_s`` after the one before."""

@@ -12,13 +12,12 @@ from collections.abc import Callable, Mapping
 from random import Random
 from types import MappingProxyType
 
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, SetDocument
 from zsched.core.electorate.documents import Documents
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.roll import Admission, Roll
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
+from zsched.core.values import instructions as do
 from zsched.core.values.adoption import obstacle
 from zsched.core.values.change import Rewrite
 from zsched.core.values.document import Flag
@@ -30,6 +29,7 @@ from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refu
 from zsched.core.values.model import NO_BALLOT, NodeId, RegisterState, TaskId
 from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.struct import replace
+from zsched.core.values.todo import ToDo
 
 
 class Numbers:

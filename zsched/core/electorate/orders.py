@@ -11,11 +11,10 @@ any name there. The node that takes the command writes the name of who gives it 
 
 from __future__ import annotations
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, FleetChange, RemoveElector, SetDocument
 from zsched.core.electorate.numbers import Numbers
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.change import Rewrite, RoundOutcome, told_end
 from zsched.core.values.document import Document, Flag, in_the_name_of
 from zsched.core.values.electorate import FleetValue
@@ -23,6 +22,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, CommandResult
 from zsched.core.values.model import as_reason, told_by
 from zsched.core.values.struct import replace
+from zsched.core.values.todo import ToDo
 
 MAX_OPEN = 16
 """Operators' commands that may wait for their documents; of more the oldest ends, and its operator is answered so."""

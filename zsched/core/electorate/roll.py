@@ -21,14 +21,14 @@ from random import Random
 
 from zsched.core.electorate.changes import AdoptDocument, FleetChange, SetDocument
 from zsched.core.electorate.settling import Settling
-from zsched.core.instructions import AskFleet, TellFleet
 from zsched.core.register.fleet_register import FleetRegister
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.fleet import Timing
+from zsched.core.values.instructions import AskFleet, TellFleet
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import NO_BALLOT, Ballot, NodeId, RegisterState, TaskId
+from zsched.core.values.todo import ToDo
 
 
 class Admission(StrEnum):

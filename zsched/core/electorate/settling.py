@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterable
 
 from zsched.core.electorate.changes import Settle
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.electorate import Electorate, FleetValue
 from zsched.core.values.fleet import Timing
 from zsched.core.values.lease import hold_s
+from zsched.core.values.todo import ToDo
 
 
 class Settling:

@@ -38,13 +38,13 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from zsched.core.instructions import ApplyRoutes, EndTask, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.route.route import plan_for, slot_for
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, TaskSpec, runs_worker
+from zsched.core.values.instructions import ApplyRoutes, EndTask, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.values.model import Allocation, NodeId, NodeKind
 from zsched.core.values.plan import DrainingSlot, Role, Route, RoutePhase, RoutePlan, Slot, WorkerRole
 from zsched.core.values.struct import Struct, replace
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import shown
 
 ROLE_DRAIN_MARGIN_S = 1.0
@@ -53,7 +53,7 @@ ROLE_DRAIN_MARGIN_S = 1.0
 A cold one is stopped then, also where it had to go idle at once: until then it is asked for its state.
 """
 MAX_OLD = 3
-"""Predecessors that are kept: a plan has to fit into a frame (`zsched.wire.codec`)."""
+"""Predecessors that are kept: a plan has to fit into a frame (`zsched.core.values.codec`)."""
 LEAVES_S = 1.0
 """A worker that has drained, or that is ready only now, learns within this time that it is idle."""
 HEARS_S = 5.0

@@ -24,14 +24,14 @@ from collections.abc import Set as AbstractSet
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.rhythm import COUNT_S, Progress
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import RecordStory, RestartWorker
 from zsched.core.scheduler.probation import LIMIT_S
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import RecordStory, RestartWorker
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.plan import StreamCount
 from zsched.core.values.profile import Profile, TaskProgress, WorkerState
+from zsched.core.values.todo import ToDo
 
 MARGIN_S = 1.5
 """A complaint may be this much older than the answer that ends it: `COUNT_S` and a profile's way."""

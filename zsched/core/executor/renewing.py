@@ -23,12 +23,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 
-from zsched.core.instructions import RecordStory, RenewWorker
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, TaskSpec
+from zsched.core.values.instructions import RecordStory, RenewWorker
 from zsched.core.values.model import Allocation, NodeId, TaskId
 from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field
+from zsched.core.values.todo import ToDo
 
 SAME_FILE_S = 1.0
 """A candidate has beaten by the same fleet file for this long: its profile tells of its own worker."""

@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from zsched.core.absence import FORGIVEN_RATIO
 from zsched.core.executor.handover import Executor, Phase
+from zsched.core.values.absence import FORGIVEN_RATIO
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import TaskId

@@ -4,7 +4,7 @@ The document says it (`zsched.core.values.document.Rollout`), so it is agreed an
 waits makes its worker by the recipe of before (`TaskSpec.worker_on`), so nothing here orders any restart.
 
 Knows: the rollouts of the fleet in force, since when this node has known each. Does not know: processes; whose worker
-has started again (profiles tell), who begins and ends a rollout (`zsched.commands.rollout`).
+has started again (profiles tell), who begins and ends a rollout (`zsched.commands.base.rollout`).
 """
 
 from __future__ import annotations

@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from zsched.core.absence import Absences
-from zsched.core.events import ClockCompared
 from zsched.core.executor.handover import Executor
 from zsched.core.membership.peers import Membership
-from zsched.core.todo import ToDo
+from zsched.core.values.absence import Absences
 from zsched.core.values.beat import Beat
+from zsched.core.values.events import ClockCompared
 from zsched.core.values.fleet import OnIsolation
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId
 from zsched.core.values.quorum import majority
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.clocks import ClockDoubt
 from zsched.core.vote.lease import Leases
 
@@ -134,7 +134,7 @@ class Tenure:
         """Whether the worker of a task that this node owns rests for want of a lease, and has for too long. Each turn.
 
         Until nobody works without a lease any more, and while another owner waits, it rests for others' sake. A lease
-        that is there now and then is missed as one that is not: absences add up (`zsched.core.absence`).
+        that is there now and then is missed as one that is not: absences add up (`zsched.core.values.absence`).
         """
         epoch, absences = self._absences.get(value.task, (value.epoch, Absences()))
         if epoch != value.epoch:

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 
-from zsched.core import events as ev
-from zsched.core.instructions import RecordStory
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet, runs_worker
+from zsched.core.values.instructions import RecordStory
 from zsched.core.values.model import NodeId, TaskId, as_reason
 from zsched.core.values.profile import Profile, Renewal, WorkerState
 from zsched.core.values.struct import Struct, field

@@ -11,12 +11,12 @@ from collections.abc import Mapping
 
 from zsched.core.gateway.demand import Demands, Need, speed_of
 from zsched.core.gateway.sharing import Shares
-from zsched.core.sequence import Order, Track
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.gauges import BY_NAME, possible
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId
 from zsched.core.values.profile import Profile
+from zsched.core.values.sequence import Order, Track
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import GaugeName
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import Any, Final, NamedTuple
 
-from zsched.core.relay_protocol import EndMarker
+from zsched.core.values.relay_protocol import EndMarker
 
 RESEND_S: Final = 0.3
 """What is not acknowledged is put again when nothing has moved for this time, at the earliest."""

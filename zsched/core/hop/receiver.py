@@ -1,7 +1,7 @@
 """The receiving side of a numbered hop: what has come of one publisher, what is missing, what is lost.
 
 Knows: the numbers of one publisher. Does not know: what a sample is, who sends it, threads, when an acknowledgement
-leaves (`zsched.hop.acknowledger`). The time is passed in (monotonic seconds).
+leaves (`zsched.link.acknowledger`). The time is passed in (monotonic seconds).
 
 Where everything is wanted, a number that is out of turn has to wait and the missing ones are asked for, at most for
 `GIVE_UP_S`: then what is missing is lost and the stream goes on. Who wants only the newest takes any newer one. Numbers
@@ -19,7 +19,7 @@ from collections import deque
 from typing import Final
 
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.relay_protocol import StreamAck, mark_of
+from zsched.core.values.relay_protocol import StreamAck, mark_of
 from zsched.core.values.struct import Struct, field
 
 SourceName = tuple[str, str, int]

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 from zsched.core.hop.kept import NOTHING, RESEND_S, Kept, Owed, Sent
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.relay_protocol import StreamAck
+from zsched.core.values.relay_protocol import StreamAck
 from zsched.core.values.struct import Struct, field, replace
 
 KEPT_SAMPLES: Final = 2048

@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 
 from zsched.core.hop.kept import NOTHING, RESEND_S, Kept, Owed, Sent
 from zsched.core.hop.sender import near
-from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.values.relay_protocol import EndMarker, StreamAck
 from zsched.core.values.struct import Struct, field
 
 SHARED_BYTES: Final = 32 << 20

@@ -8,11 +8,10 @@ Knows: how many bytes a beat's parts take at most. Does not know: the bytes them
 
 from __future__ import annotations
 
-from zsched.core.values.beat import Beat, Grant
+from zsched.core.values.beat import MAX_BEAT_BYTES, Beat, Grant
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.struct import Struct, replace
 
-MAX_BEAT_BYTES = 16 * 1024
 FRAME_BYTES = 704
 """Room for the frame, the names of the fields and the fields with one value."""
 _NUMBER = 9

@@ -25,11 +25,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from zsched.core.sequence import Order, Track
 from zsched.core.values.beat import Beat
 from zsched.core.values.fleet import Timing
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, PeerState, TaskId
+from zsched.core.values.sequence import Order, Track
 from zsched.core.values.struct import Struct, field
 
 NEW_TIMES = 2.0

@@ -1,7 +1,7 @@
 """PROFILE, a worker's threads: which of them would use a whole core if they never had to wait?
 
 Knows: shares of time, smoothing. Does not know: where the kernel reports them
-(`zsched.adapters.machine.device_profiler`), needs.
+(`zsched.host.machine.device_profiler`), needs.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ import math
 from collections import deque
 from typing import Final
 
-from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.profile import MAX_JOB_S, MAX_JOBS_HZ, Jobs
 
 QUEUE_S = 2.0

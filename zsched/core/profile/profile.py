@@ -14,9 +14,9 @@ import statistics
 from collections import deque
 from collections.abc import Mapping
 
-from zsched.core.events import WorkerJobs
 from zsched.core.profile.jobs import JobMeter
 from zsched.core.profile.means import STALE_S, Ewma
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.fleet import Timing
 from zsched.core.values.gauges import possible
 from zsched.core.values.model import NodeId, TaskId

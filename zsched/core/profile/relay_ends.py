@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from zsched.core.events import RelayChanged
+from zsched.core.values.events import RelayChanged
 from zsched.core.values.model import as_reason
 from zsched.core.values.struct import Struct, field
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from zsched.core.instructions import AskElectors
 from zsched.core.register.register import Register
-from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
 from zsched.core.values.electorate import Electorate, FleetValue
+from zsched.core.values.instructions import AskElectors
 from zsched.core.values.messages import Accept, Prepare
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import CREATION_STEP
 
 

@@ -28,7 +28,6 @@ from enum import StrEnum
 from random import Random
 from typing import Generic
 
-from zsched.core.todo import ToDo
 from zsched.core.values.change import Rewrite, RoundOutcome
 from zsched.core.values.electorate import Electorate, electorate_of
 from zsched.core.values.fleet import Timing
@@ -36,6 +35,7 @@ from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refu
 from zsched.core.values.model import Acceptance, Ballot, NodeId, RegisterState, V
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, field, replace
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import shown
 
 BACKOFF_CAP_S = 5.0

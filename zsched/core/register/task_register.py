@@ -6,12 +6,12 @@ Knows: allocations and their changes, which instructions a round's questions are
 
 from __future__ import annotations
 
-from zsched.core.instructions import SendAccept, SendPrepare
 from zsched.core.register.register import Register
-from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner, Retune, Rewrite, RoundOutcome, SetHold, SetLeased
+from zsched.core.values.instructions import SendAccept, SendPrepare
 from zsched.core.values.messages import Accept, Prepare
 from zsched.core.values.model import Allocation
+from zsched.core.values.todo import ToDo
 
 
 class TaskRegister(Register[Allocation]):

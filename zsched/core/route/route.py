@@ -10,11 +10,11 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route import keyexpr
 from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, runs_worker
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.plan import Direction, ReadyWhen, RosGraph, Route, RoutePhase, RoutePlan, Slot
+from zsched.core.values.relay_protocol import WorkerWatch
 
 PLACEHOLDERS: Final = ("robot", "node", "target", "task", "epoch")
 BRACES: Final = re.compile(r"\{([^{}]*)\}")

@@ -1,7 +1,7 @@
 """SCHEDULER, for an operator: the sums of one judgement, and what would have to change for a move.
 
 Knows: how the terms become a total, and the order in which a judgement is held back. Does not know: how that is shown
-(`zsched.commands.explain`), live state: it goes by written figures alone.
+(`zsched.commands.look.explain`), live state: it goes by written figures alone.
 
 The sums are not taken from the verdict. They are made again, so that a reader can check them.
 """

@@ -15,11 +15,11 @@ from collections.abc import Set as AbstractSet
 from enum import StrEnum
 from typing import Final
 
-from zsched.core.absence import Absences
 from zsched.core.scheduler.fuse import ESCAPES_PER_MINUTE, WINDOW_S, Fuse
 from zsched.core.scheduler.kept import Kept
 from zsched.core.scheduler.ledger import Ledger
 from zsched.core.scheduler.standing import LOST_S, Standing, pick
+from zsched.core.values.absence import Absences
 from zsched.core.values.decision import JudgeMemory
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.model import Allocation, NodeId, Pause, PeerState, Pin, told_by
@@ -108,7 +108,7 @@ class Judge:
         """For how many seconds the owner's worker was heard not to be ready; who is not heard says nothing about it.
 
         A worker that is started anew on purpose, once or twice, is waited for; one that is ready now and then
-        is left once its absences are longer than a start-up (`zsched.core.absence`).
+        is left once its absences are longer than a start-up (`zsched.core.values.absence`).
         """
         if profile is None:
             self.absences.skip(now)

@@ -20,7 +20,6 @@ from random import Random
 
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.gateway.round_trips import RoundTrips
-from zsched.core.instructions import AskUtilities, RecordStory
 from zsched.core.scheduler.claims import claims_of_others, taken
 from zsched.core.scheduler.decision import decide, rules_of, verdict_of
 from zsched.core.scheduler.eligibility import NO_DOUBTS, Doubts, has_living_owner, is_out
@@ -33,10 +32,10 @@ from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import Standing
 from zsched.core.scheduler.turns import Turn, in_turn, who_moves_first
 from zsched.core.scheduler.usage import book
-from zsched.core.todo import ToDo
 from zsched.core.values.decision import Decision, Figures, Need, Rules
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import AskUtilities, RecordStory
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import (
     MAX_AGGREGATE,
@@ -49,6 +48,7 @@ from zsched.core.values.model import (
     UtilityVector,
 )
 from zsched.core.values.struct import Struct
+from zsched.core.values.todo import ToDo
 from zsched.core.values.veto import Filter
 
 HEARD = (PeerState.ALIVE, PeerState.SUSPECT)

@@ -8,7 +8,7 @@ answers and scores as any other, and no stream reaches its worker. A robot says 
 unseen for `UNSEEN_S`, while the worker of another candidate is seen: then our own relay's links work, and there is a
 better place. Where this robot is a candidate itself, with a ready worker, and no other one shares the task, its own
 place is as good as one that is seen. By the task's `reach` such a candidate gets nothing, and an owner is left. One
-that is unseen again and again has that time in all (`zsched.core.absence`). Nor does it get the task between two
+that is unseen again and again has that time in all (`zsched.core.values.absence`). Nor does it get the task between two
 absences, while that has an owner which is seen and does not come and go.
 
 Workers that show no token before they own the task say nothing here.
@@ -19,8 +19,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from zsched.core.absence import Absences
 from zsched.core.scheduler.probation import Probation, shows_token
+from zsched.core.values.absence import Absences
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, TaskId

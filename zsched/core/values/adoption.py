@@ -1,7 +1,7 @@
 """What of a changed fleet file a running node can take over, and what only its next start does.
 
 Knows: which fields a daemon is built on for its whole life. Does not know: how a node takes the rest over
-(`zsched.core.handlers.fleet`), sessions and processes (`zsched.runtime.restarts`).
+(`zsched.core.node.fleet`), sessions and processes (`zsched.link.sessions.restarts`).
 """
 
 from __future__ import annotations

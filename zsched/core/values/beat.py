@@ -10,6 +10,8 @@ from zsched.core.values.model import NodeId, TaskId, check_counter, check_length
 from zsched.core.values.struct import Struct
 from zsched.core.values.words import check_range
 
+MAX_BEAT_BYTES = 16 * 1024
+
 
 class Grant(Struct, frozen=True, kw_only=True):
     """An exclusive task's lease in numbers: beat ``number`` of ``owner``'s life ``incarnation``, working in ``epoch``.

@@ -1,6 +1,6 @@
 """Certificate names: who holds a certificate of the fleet, in which role, with which key (pure).
 
-Knows: the shape of the names. Does not know: certificates, who may do what (`zsched.runtime.access_rules`).
+Knows: the shape of the names. Does not know: certificates, who may do what (`zsched.link.sessions.access_rules`).
 
 The common name of a certificate is ``<label>.<fleet>.zsched.internal``. No public authority issues names below
 ``internal``, so a certificate of the public web never bears one. The label is ``robot1`` for a node,

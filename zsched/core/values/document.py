@@ -1,7 +1,7 @@
 """The fleet's document: the fleet file's text as its operator wrote it, and what operators have said since.
 
 Knows: the fields of a document and their sizes. Does not know: what the text means (`zsched.config`), its hash
-(`zsched.wire.codec`), who agrees on it (`zsched.core.electorate`).
+(`zsched.core.values.codec`), who agrees on it (`zsched.core.electorate`).
 """
 
 from __future__ import annotations

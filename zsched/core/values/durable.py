@@ -1,6 +1,6 @@
 """What a node keeps across restarts: one value, one file.
 
-Knows: the fields of the state. Does not know: bytes, disks (`zsched.adapters.host.state_file`), what the fields mean to
+Knows: the fields of the state. Does not know: bytes, disks (`zsched.host.state_file`), what the fields mean to
 their stages.
 """
 
@@ -12,7 +12,7 @@ from zsched.core.values.struct import Struct
 
 
 class DurableState(Struct, frozen=True, kw_only=True):
-    """Everything that a node keeps across restarts (one file, `zsched.adapters.host.state_file`)."""
+    """Everything that a node keeps across restarts (one file, `zsched.host.state_file`)."""
 
     fleet: str
     node: NodeId

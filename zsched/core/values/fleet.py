@@ -457,7 +457,7 @@ class Fleet:
     shared_memory: SharedMemory = key(
         SharedMemory.OFF, "Large payloads within a machine; `auto`: where the node finds it fit."
     )
-    """Fit is its /dev/shm (`zsched.adapters.machine.shared_memory`)."""
+    """Fit is its /dev/shm (`zsched.host.machine.shared_memory`)."""
 
     @property
     def voters(self) -> tuple[NodeId, ...]:

@@ -1,7 +1,7 @@
 """The gauges: figures of a machine, beside CPU, memory and links, that a task may weigh or limit.
 
 Knows: each gauge's name, range, worth and limit. Does not know: how one is read (a file of the gauge's name in
-`zsched/adapters/machine/gauges/`).
+`zsched/host/machine/gauges/`).
 
 A new gauge is a row of `GAUGES` and that file. The name is the key in the fleet file (`weights:`, `limits:`), in
 profiles and in JSON.

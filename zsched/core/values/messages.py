@@ -32,7 +32,7 @@ from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import MAX_ASKER, check_range
 
 _CURSOR: Final = re.compile(r"([0-9]{1,20}:[0-9]{1,15})?")
-"""A file of the log and an offset in it (`zsched.adapters.host.decision_log`)."""
+"""A file of the log and an offset in it (`zsched.host.decision_log`)."""
 MAX_CERTIFICATE: Final = 4096
 """Characters of a certificate that is sent to a node; those of `zsched pki` have 900."""
 

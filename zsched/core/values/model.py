@@ -4,8 +4,8 @@ Knows: what a value means, in which unit and range. Does not know: how it is mea
 of its machine (`zsched.core.values.profile`) and of itself (`zsched.core.values.beat`).
 
 Every class is a frozen dataclass whose fields are plain (str, int, float, bool, enum, tuple, another value), so that
-`zsched.wire.codec` can encode any of them and no object is ever shared with an adapter. ``None`` means "not measured"
-or "not there", never -1. A value out of range raises `ValueError` naming the field: from the wire that is a counted,
+`zsched.core.values.codec` can encode any of them and no object is ever shared with an adapter. ``None`` means "not
+measured" or "not there", never -1. A value out of range raises `ValueError` naming the field: from the wire that is a counted,
 dropped frame; from our own code it is a bug.
 """
 

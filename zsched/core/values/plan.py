@@ -183,7 +183,7 @@ class Role(Struct, frozen=True, kw_only=True):
     there was none, or it is known to be gone.
 
     ``lease_until_s`` is set for exclusive tasks only: the worker publishes nothing from then on (seconds of this
-    machine by `zsched.clock.monotonic_s`; 0: it has no lease yet).
+    machine by `zsched.host.clock.monotonic_s`; 0: it has no lease yet).
     """
 
     task: TaskId

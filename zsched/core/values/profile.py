@@ -225,7 +225,7 @@ class Profile(Struct, frozen=True, kw_only=True):
     progress: tuple[TaskProgress, ...] = ()
     """Robots: the watched tasks that answer here, or fail to although inputs flow."""
     speed: float | None = None
-    """How fast one of its cores is (`zsched.adapters.machine.core_speed`); ``None``: not measured."""
+    """How fast one of its cores is (`zsched.host.machine.core_speed`); ``None``: not measured."""
     cpu_pressure: float | None = None
     """Share of the time in which some process wanted a CPU and had none (PSI "some"); ``None``: not measured."""
     echoes: tuple[Echo, ...] = ()

@@ -1,6 +1,6 @@
 """The values of a rehearsal: its steps, what the documents promise for each, and what an operator asks of nodes.
 
-Knows: fields and their ranges. Does not know: which step comes when (`zsched.core.rehearsal.programme`).
+Knows: fields and their ranges. Does not know: which step comes when (`zsched.tools.rehearsal.programme`).
 """
 
 from __future__ import annotations

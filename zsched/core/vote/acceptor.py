@@ -10,14 +10,14 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused, fleet_answer
 from zsched.core.values.model import Ballot, NodeId, TaskId
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.belief import is_fit, is_fleet_fit
 from zsched.core.vote.lease import Leases
 from zsched.core.vote.witness import Witness

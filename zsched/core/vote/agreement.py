@@ -13,15 +13,14 @@ from collections.abc import Mapping
 from random import Random
 from types import MappingProxyType
 
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import FleetChange
 from zsched.core.electorate.helm import Helm, voters
 from zsched.core.electorate.numbers import Numbers
 from zsched.core.electorate.orders import Orders
 from zsched.core.electorate.strangers import SHOWN_S, Strangers
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import Change, Ended, MoveOwner, RoundOutcome
 from zsched.core.values.document import Flag
@@ -34,6 +33,7 @@ from zsched.core.values.messages import Accepted, FleetQuestion, Learnt, Promise
 from zsched.core.values.model import NO_BALLOT, Allocation, NodeId, RegisterState, TaskId
 from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.struct import replace
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import CREATION_STEP, shown
 from zsched.core.vote.acceptor import Acceptor
 from zsched.core.vote.belief import GENERATION_STEP, MAX_GENERATION, is_fleet_fit, is_proven

@@ -1,7 +1,7 @@
 """VOTE, this machine's clock: does a second last as long here as elsewhere? Leases depend on it.
 
 Knows: how far two clocks of one machine may drift apart before one of them is wrong. Does not know: clocks
-(`zsched.clock` reads and compares them), which of the two is wrong, what follows for leases (`zsched.core.vote.lease`).
+(`zsched.host.clock` reads and compares them), which of the two is wrong, what follows for leases.
 
 The machine's time service slews one clock and not the other. When their rates differ by more than the bound of the
 leases, or when they jump apart (a suspend, whose length some machines know only to a second), other nodes cannot trust
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 
-from zsched.core.events import ClockCompared
+from zsched.core.values.events import ClockCompared
 from zsched.core.values.lease import RHO
 from zsched.core.values.struct import Struct
 

@@ -5,11 +5,11 @@ Knows: commands, outcomes in words. Does not know: rounds (`zsched.core.register
 
 from __future__ import annotations
 
-from zsched.core import instructions as do
-from zsched.core.todo import ToDo
+from zsched.core.values import instructions as do
 from zsched.core.values.change import Ended, SetLeased, told_end
 from zsched.core.values.messages import CommandOutcome, CommandResult
 from zsched.core.values.model import Allocation
+from zsched.core.values.todo import ToDo
 
 
 def refuse_gone(ended: Ended, todo: ToDo) -> None:

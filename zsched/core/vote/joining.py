@@ -12,8 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from zsched.core.instructions import AskElectors, Instruction, SendAccept, SendBallots, SendPrepare
 from zsched.core.values.electorate import FleetValue
+from zsched.core.values.instructions import AskElectors, Instruction, SendAccept, SendBallots, SendPrepare
 from zsched.core.values.messages import MOST_BALLOTS, Ballots, Prepare
 
 

@@ -11,7 +11,7 @@ own.
   L after the *sending* of the largest number that a majority has echoed or exceeded. An elector may echo a number that
   the owner has not sent yet, because of a forged beat. It then counts from an earlier moment than the owner would, so
   its echo of that number never counts. It grants the real, lower numbers again once they are believed
-  (`zsched.core.sequence`).
+  (`zsched.core.values.sequence`).
 * Electors grant only a task that is *leased* for everybody (`Allocation.leased`, `zsched.core.executor.sealing`).
 * A node that is no elector grants nothing, even where its name has a seat (of a disk that it has lost). Nobody would
   wait for such a grant to end.

@@ -14,13 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from zsched.core.instructions import PublishProposal, RecordStory
-from zsched.core.todo import ToDo
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.fleet import Timing
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import PublishProposal, RecordStory
 from zsched.core.values.model import Allocation, NodeId, PeerState, Proposal, TaskId
 from zsched.core.values.quorum import present_voters
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.tally import Tally, VoteOutcome, tally
 
 VOTE_MARGIN_S = 0.1

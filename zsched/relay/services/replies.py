@@ -15,8 +15,8 @@ from typing import Any, Final
 import zenoh
 from zenoh import Reply, Session
 
-from zsched.clock import monotonic_s
-from zsched.guard import tolerant
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import tolerant
 
 MAX_WAITING: Final = 1024
 """Replies that may wait for a slow asker; further ones are dropped, and `Replies.has_overflowed` says so."""

@@ -34,18 +34,18 @@ from typing import Final
 import zenoh
 from zenoh import Query, Reply, Sample, SampleKind, Session
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.books import add_to, added, closed
-from zsched.core.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.core.route.keyexpr import is_wild
 from zsched.core.route.wildcards import Rewriter, capture_fault, rewriter
 from zsched.core.values.plan import Route, StreamCount
+from zsched.core.values.relay_protocol import ERROR_ENCODING, REFUSED_ENCODING, ServiceProblem
 from zsched.core.values.struct import Struct, field
-from zsched.guard import guarded, note, tolerant
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded, note, tolerant
+from zsched.link.sessions.matching import is_matched
 from zsched.relay.services.replies import Replies
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import Declared, undeclare
-from zsched.sessions.matching import is_matched
 
 LOOK_AGAIN_S: Final = 0.02
 """How often a waiting request looks for an owner; a flip wakes it at once."""

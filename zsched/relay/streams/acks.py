@@ -16,17 +16,17 @@ from weakref import WeakSet
 
 from zenoh import CongestionControl, Priority, Sample, Session
 
-from zsched.clock import monotonic_s
-from zsched.core.relay_protocol import StreamAck, StreamAcks
+from zsched.core.values import codec as wire
+from zsched.core.values.errors import WireError
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import NodeId, TaskId
+from zsched.core.values.relay_protocol import StreamAck, StreamAcks
 from zsched.core.values.struct import Struct
-from zsched.errors import WireError
-from zsched.guard import tolerant
-from zsched.hop.acknowledger import Acknowledger
-from zsched.sessions.stalled_links import StalledLinks
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace, parse
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import tolerant
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import Keyspace, parse
+from zsched.link.sessions.stalled_links import StalledLinks
 
 DEFAULT_LEASE_S: Final = Timing().zenoh_lease_s
 

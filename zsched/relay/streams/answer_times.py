@@ -15,7 +15,7 @@ from typing import Final
 
 from zenoh import Timestamp
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 
 MAX_SENT: Final = 256
 """At most this many inputs wait for their answer; a slower worker is measured by the newest one."""

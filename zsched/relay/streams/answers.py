@@ -20,11 +20,11 @@ from zenoh import Sample
 
 from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, SourceName
 from zsched.core.hop.serial import serial_of
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker
 from zsched.core.values.struct import Struct, field
-from zsched.hop.acknowledger import Acknowledger
-from zsched.hop.weight import weight
-from zsched.ipc.pipe import decode_end
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.pipe.frames import decode_end
+from zsched.link.weight import weight
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.given import under
 

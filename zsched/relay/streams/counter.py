@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from zsched.clock import monotonic_s
 from zsched.core.values.plan import STILL_S, StreamCount
+from zsched.host.clock import monotonic_s
 from zsched.relay.streams.tally import Tally
 
 

@@ -1,6 +1,6 @@
 """Puts a stream's outputs to all its applications, and leaves behind the one that takes too little.
 
-Knows: whose link has room (`zsched.sessions.link_sockets`), which sessions are workers', when to wait and when not.
+Knows: whose link has room (`zsched.link.sessions.link_sockets`), which sessions are workers, when to wait.
 Does not know: zenoh's queues, which stream this is, who of those that are linked receives it: whose link fills up
 receives something.
 
@@ -29,11 +29,11 @@ from typing import Final
 
 from zenoh import Sample, Session, Timestamp
 
-from zsched.clock import monotonic_s
 from zsched.core.values.struct import Struct
+from zsched.host.clock import monotonic_s
+from zsched.link.sessions.link_sockets import LinkSocket, LinkSockets, with_room
+from zsched.link.sessions.send_queue import NO_ROOM_S
 from zsched.relay.streams.lanes import Lane
-from zsched.sessions.link_sockets import LinkSocket, LinkSockets, with_room
-from zsched.sessions.send_queue import NO_ROOM_S
 
 LOOK_S: Final = 1.0
 """How old our knowledge of the links may be."""

@@ -14,7 +14,7 @@ from typing import Final
 
 from zenoh import Timestamp
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
 
 FENCE_S: Final = 2.0
 """For this long after a new owner took over, its answers to values older than what has passed are dropped."""

@@ -18,9 +18,9 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from zsched.clock import monotonic_s
+from zsched.host.clock import monotonic_s
+from zsched.link.sessions.matching import is_matched
 from zsched.relay.streams.lanes import Lane
-from zsched.sessions.matching import is_matched
 
 STRANGE_S: Final = 1.0
 FOREIGN_S: Final = 10.0

@@ -20,9 +20,9 @@ from typing import Final
 import zenoh
 from zenoh import Sample, SampleKind, Session
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.serial import number_near
-from zsched.guard import guarded, tolerant
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import guarded, tolerant
 from zsched.relay.streams.places import PublisherId
 from zsched.relay.streams.questions import ADVANCED, Publisher, Question, Questions, publisher_of
 

@@ -22,10 +22,11 @@ from typing import Final
 import zenoh
 from zenoh import Sample, Session, Timestamp
 
-from zsched.clock import monotonic_s
 from zsched.core.values.plan import OnCrash, Route, StreamClass, StreamCount
 from zsched.core.values.struct import Struct
-from zsched.hop.weight import weight
+from zsched.host.clock import monotonic_s
+from zsched.link.sessions.send_queue import MAX_BYTES
+from zsched.link.weight import weight
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.counter import StreamCounter
@@ -35,7 +36,6 @@ from zsched.relay.streams.places import Places, PublisherId
 from zsched.relay.streams.proofs import LeftOpen, Stamps, unproven
 from zsched.relay.streams.receive import Receiver
 from zsched.relay.streams.tally import Tally
-from zsched.sessions.send_queue import MAX_BYTES
 
 MAX_KEYS: Final = 4096
 """Lines of one stream whose values are kept; the oldest give way."""

@@ -21,10 +21,10 @@ from zenoh import CongestionControl, Priority, Reliability, Sample, SampleKind, 
 from zsched.core.hop.kept import Sent
 from zsched.core.hop.sender import Sender
 from zsched.core.hop.serial import serial_of
-from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import StreamClass, StreamSettings
-from zsched.ipc.pipe import encode_end
-from zsched.wire.keyspace import END_CHUNK
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.link.keyspace import END_CHUNK
+from zsched.link.pipe.frames import encode_end
 
 _DELETE: Final = SampleKind.DELETE
 _Plain = zenoh.Publisher

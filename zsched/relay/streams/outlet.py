@@ -7,7 +7,7 @@ timestamp, kind, priority and express. The source info becomes the publisher's o
 number is what the next hop checks and acknowledges.
 
 ``best_effort`` is put at once and dropped where it would wait. ``latest`` and ``reliable`` have a queue and a thread
-(`zsched.sessions.send_queue`) and wait there, so that only this target waits when its receiver stalls.
+(`zsched.link.sessions.send_queue`) and wait there, so that only this target waits when its receiver stalls.
 
 Where the receiver is `zsched.worker`, samples are kept until it acknowledges them. A number that did not come, or no
 progress for a while (`Lane.is_late`), and they are put again under the numbers they had; the worker drops what it has
@@ -26,14 +26,16 @@ from typing import Any, Final
 import zenoh
 from zenoh import Priority, Sample, Session, Timestamp
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.kept import NOTHING, Owed
 from zsched.core.hop.sender import KEPT_BYTES, KEPT_BYTES_LATEST, KEPT_SAMPLES
-from zsched.core.relay_protocol import EndMarker, StreamAck, mark_of
 from zsched.core.route.wildcards import Rewriting
 from zsched.core.values.plan import OnCrash, StreamClass, StreamSettings
-from zsched.guard import tolerant
-from zsched.hop.weight import weight
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, mark_of
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import tolerant
+from zsched.link.sessions.matching import is_matched
+from zsched.link.sessions.send_queue import SendQueue
+from zsched.link.weight import weight
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.crowd import Crowd
 from zsched.relay.streams.greetings import Greetings
@@ -41,8 +43,6 @@ from zsched.relay.streams.lanes import Lane, declare_publisher, put_marker
 from zsched.relay.streams.proofs import LeftOpen
 from zsched.relay.streams.receive import undeclare
 from zsched.relay.streams.tally import Tally
-from zsched.sessions.matching import is_matched
-from zsched.sessions.send_queue import SendQueue
 
 QUEUE_DEPTH: Final = 1024
 """A reliable outlet's queue holds at least this many samples, whatever its depth says."""

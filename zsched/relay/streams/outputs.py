@@ -18,14 +18,15 @@ from typing import Final
 import zenoh
 from zenoh import CongestionControl, Sample, Session, Timestamp
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.receiver import SourceName
 from zsched.core.values.plan import HandoverRule, Route, StreamClass, StreamCount
 from zsched.core.values.struct import replace
-from zsched.guard import tolerant
-from zsched.hop.acknowledger import Acknowledger
-from zsched.hop.weight import weight
-from zsched.ipc.pipe import decode_end
+from zsched.host.clock import monotonic_s
+from zsched.host.guard import tolerant
+from zsched.link.acknowledger import Acknowledger
+from zsched.link.keyspace import AGAIN_CHUNK, END_CHUNK
+from zsched.link.pipe.frames import decode_end
+from zsched.link.weight import weight
 from zsched.relay.streams.acks import WorkerAcks
 from zsched.relay.streams.answer_times import AnswerTimes
 from zsched.relay.streams.answers import Answers
@@ -38,7 +39,6 @@ from zsched.relay.streams.places import Places, PublisherId
 from zsched.relay.streams.receive import Receiver, undeclare
 from zsched.relay.streams.slots import Feed, KeyState, OutputSlot
 from zsched.relay.streams.tally import Tally
-from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK
 
 HOLD_SAMPLES: Final = 10_000
 HOLD_BYTES: Final = 64 << 20

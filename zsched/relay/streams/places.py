@@ -16,8 +16,8 @@ from typing import Final
 
 from zenoh import Sample
 
-from zsched.clock import monotonic_s
 from zsched.core.values.struct import Struct
+from zsched.host.clock import monotonic_s
 
 MAX_KEYS: Final = 4096
 MAX_PLACES: Final = 256

@@ -22,10 +22,10 @@ from typing import Any, Final, Protocol
 import zenoh
 from zenoh import Sample, Session
 
-from zsched.clock import awake_s
 from zsched.core.route.ros2 import BUFFERS, has_buffers_beside
 from zsched.core.values.plan import StreamClass, StreamSettings
-from zsched.guard import guarded, tolerant
+from zsched.host.clock import awake_s
+from zsched.host.guard import guarded, tolerant
 from zsched.relay.streams.given import under
 from zsched.relay.streams.history import HeldValues
 from zsched.relay.streams.places import PublisherId

@@ -14,12 +14,12 @@ from typing import Final
 
 from zenoh import Sample
 
-from zsched.clock import monotonic_s
 from zsched.core.hop.receiver import GIVE_UP_S, MAX_SOURCES, Source, SourceName
 from zsched.core.hop.serial import number_near, serial_of
-from zsched.core.relay_protocol import EndMarker
 from zsched.core.route import keyexpr
+from zsched.core.values.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct, field, replace
+from zsched.host.clock import monotonic_s
 from zsched.relay.streams.answers import Answers
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.receive import Receiver

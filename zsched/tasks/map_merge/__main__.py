@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from zsched.errors import ConfigError
-from zsched.exits import EXIT_CONFIG
+from zsched.core.values.errors import ConfigError
+from zsched.core.values.exits import EXIT_CONFIG
 
 
 def _positive(text: str) -> float:

@@ -14,8 +14,8 @@ import struct
 
 import numpy as np
 
+from zsched.core.values.errors import WireError
 from zsched.core.values.struct import Struct
-from zsched.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import MAX_CELLS, MAX_SIDE_CELLS, Grid
 

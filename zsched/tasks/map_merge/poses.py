@@ -12,8 +12,8 @@ from pathlib import Path
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.words import NAME
-from zsched.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2, wrap_angle
 
 _USAGE = "give robot=x,y,yaw in metres and radians, e.g. robot1=1.5,-2,1.57"

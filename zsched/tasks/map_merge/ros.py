@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from zsched.clock import wall_ns
 from zsched.core.route.ros2 import GID_BYTES, Attachment, encode_attachment
+from zsched.host.clock import wall_ns
 
 
 class RosPublisher:

@@ -20,8 +20,8 @@ from collections.abc import Mapping
 import cv2
 
 import zsched.worker
-from zsched.clock import monotonic_s
 from zsched.core.values.plan import WorkerRole
+from zsched.host.clock import monotonic_s
 from zsched.tasks.map_merge.merger import MergerSettings, Mode
 from zsched.tasks.map_merge.pairs import Rule
 from zsched.tasks.map_merge.poses import read_poses

@@ -20,10 +20,10 @@ from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Any, Protocol
 
-from zsched.clock import wall_ns
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.words import NAME
-from zsched.guard import guarded
+from zsched.host.clock import wall_ns
+from zsched.host.guard import guarded
 from zsched.tasks.map_merge.cdr import (
     MAX_STAMP_NS,
     CdrError,

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Any, Final
 
-from zsched.core.events import WorkerJobs
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.profile.profile import Profiler
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.scheduler.usage import book
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.fleet import TaskSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import Allocation, NodeId, PeerState, TaskId, Tuning

@@ -25,9 +25,9 @@ from zsched.core.hop.held import HeldInputs
 from zsched.core.hop.kept import Owed
 from zsched.core.hop.serial import SPAN, number_near, serial_of
 from zsched.core.hop.shared import FORGET_S, TICK_S, SharedSender
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
-from zsched.hop.acknowledger import ACK_S, Acknowledger
-from zsched.ipc.pipe import encode_end
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.link.acknowledger import ACK_S, Acknowledger
+from zsched.link.pipe.frames import encode_end
 from zsched.relay.streams.answers import Answers
 from zsched.relay.streams.counter import StreamCounter
 from zsched.relay.streams.slots import KeyState

@@ -20,9 +20,9 @@ from zsched.core.hop.books import unaccounted
 from zsched.core.hop.receiver import RunningTime, Source
 from zsched.core.hop.sender import KEPT_BYTES_LATEST, Sender
 from zsched.core.hop.serial import SPAN, serial_of
-from zsched.core.relay_protocol import StreamAck
 from zsched.core.values.plan import StreamCount
-from zsched.hop.acknowledger import ACK_S
+from zsched.core.values.relay_protocol import StreamAck
+from zsched.link.acknowledger import ACK_S
 from zsched.relay.streams.tally import Tally
 from zsched.relay.task import CARE_S
 from zsched_lab.sim.hop.way import SIZE, HopError, Process, Scene, Way

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from zsched.adapters.host.operator_socket import OperatorSocket
+from zsched.host.operator_socket import OperatorSocket
 
 
 def main() -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.errors import AdapterError
+from zsched.core.values.errors import AdapterError
 from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.janitor import clean, groups_of
 from zsched_lab.fleet.limits import LimitKind, NodeLimits, by_affinity, make_limits

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.operator_client import ask
 from zsched.config.load import load_fleet
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
+from zsched.host.operator_client import ask
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.demo.run import fleet_template, worker_options
 from zsched_lab.fleet.children import ChildError, Children

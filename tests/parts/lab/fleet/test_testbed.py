@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.host.state_file import StateFile
 from zsched.config.load import load_fleet
+from zsched.core.values.errors import AdapterError
 from zsched.core.values.model import NodeKind
-from zsched.errors import AdapterError
+from zsched.host.state_file import StateFile
 from zsched_lab.fleet import testbed
 from zsched_lab.fleet.loopback import own_address
 from zsched_lab.fleet.testbed import TASK, Testbed, TestbedError, echo_fleet

@@ -18,10 +18,10 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from support.waiting import free_endpoint, until
-from zsched.commands.watch.tracks import ROS_DEFINITIONS
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
+from zsched.tools.watch.tracks import ROS_DEFINITIONS
 from zsched_lab.fleet import application
 from zsched_lab.fleet.children import Children
 from zsched_lab.fleet.groups import LimitedGroup

@@ -12,14 +12,14 @@ import zenoh
 
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import until
-from zsched.core.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import Direction, HandoverRule, Route, StreamClass, StreamSettings
-from zsched.ipc.pipe import encode_end
+from zsched.core.values.relay_protocol import SKIP_ENCODING, EndMarker, StreamAck, StreamAcks
+from zsched.link.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
+from zsched.link.pipe.frames import encode_end
 from zsched.relay.streams import answers, slots
 from zsched.relay.streams.acks import Acks
 from zsched.relay.streams.outputs import OutputStream
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import AGAIN_CHUNK, END_CHUNK, Keyspace
 
 KEY = "edge1/t/1/out"
 

@@ -15,14 +15,14 @@ import zenoh
 from support.sessions import hub_and_neighbour
 from support.waiting import free_endpoint, until
 from zsched.core.values.plan import StreamClass, StreamSettings
+from zsched.link.sessions.config import client_config, data_config
+from zsched.link.sessions.link_sockets import LinkSocket, LinkSockets
+from zsched.link.sessions.send_queue import NO_ROOM_S
 from zsched.relay.streams import crowd
 from zsched.relay.streams.crowd import MAX_REST_S, REST_S, Crowd, Reader, note_feeder
 from zsched.relay.streams.given import Given
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outlet import Outlet
-from zsched.sessions.config import client_config, data_config
-from zsched.sessions.link_sockets import LinkSocket, LinkSockets
-from zsched.sessions.send_queue import NO_ROOM_S
 
 NOW = 100.0
 

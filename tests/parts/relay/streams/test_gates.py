@@ -17,9 +17,12 @@ import zenoh.ext
 from support.sessions import hub_and_neighbour, matches
 from support.waiting import between, free_endpoint, until
 from zsched.core.hop.books import unaccounted
-from zsched.core.relay_protocol import EndMarker
 from zsched.core.values.plan import Direction, HandoverRule, RosGraph, Route, StreamClass, StreamSettings
-from zsched.ipc.pipe import decode_end, encode_end
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.link.keyspace import END_CHUNK, Keyspace
+from zsched.link.pipe.frames import decode_end, encode_end
+from zsched.link.sessions import send_queue
+from zsched.link.sessions.config import worker_config
 from zsched.relay.streams import fence as fences
 from zsched.relay.streams import inputs, outlet, outputs, receive, slots
 from zsched.relay.streams.acks import Acks
@@ -27,9 +30,6 @@ from zsched.relay.streams.fence import Fence
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outputs import OutputStream
-from zsched.sessions import send_queue
-from zsched.sessions.config import worker_config
-from zsched.wire.keyspace import END_CHUNK, Keyspace
 
 
 @dataclass

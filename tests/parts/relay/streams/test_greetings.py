@@ -13,9 +13,11 @@ import zenoh
 from support.sessions import hub_and_neighbour
 from support.waiting import until
 from zsched.core.hop.books import unaccounted
-from zsched.core.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import Direction, OnCrash, Route, StreamClass, StreamSettings
-from zsched.ipc.pipe import decode_end
+from zsched.core.values.relay_protocol import EndMarker, StreamAck, StreamAcks
+from zsched.link.keyspace import END_CHUNK, Keyspace
+from zsched.link.pipe.frames import decode_end
 from zsched.relay.streams import greetings
 from zsched.relay.streams import outlet as outlets
 from zsched.relay.streams.acks import Acks
@@ -23,8 +25,6 @@ from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.lanes import Lane
 from zsched.relay.streams.outlet import Outlet
 from zsched.relay.streams.proofs import LeftOpen
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import END_CHUNK, Keyspace
 
 KEYS = Keyspace("t")
 RELIABLE = StreamSettings(stream_class=StreamClass.RELIABLE, depth=100)

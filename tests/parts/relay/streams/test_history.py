@@ -19,10 +19,10 @@ from support.signals import stand_still
 from support.waiting import free_endpoint, until
 from zsched.core.values.fleet import Timing
 from zsched.core.values.plan import StreamClass, StreamSettings
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.relay.streams import history
 from zsched.relay.streams.questions import Question, Questions
 from zsched.relay.streams.receive import Receiver
-from zsched.sessions.config import data_config, worker_config
 
 KEY = "robot1/map"
 QUERY_S = 90.0

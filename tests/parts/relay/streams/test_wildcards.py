@@ -12,12 +12,12 @@ from support.waiting import until
 from zsched.core.hop.books import unaccounted
 from zsched.core.values.fleet import LocalMode, LocalSide
 from zsched.core.values.plan import Direction, Route, StreamClass, StreamSettings
-from zsched.ipc.pipe import decode_end
+from zsched.link.keyspace import END_CHUNK
+from zsched.link.pipe.frames import decode_end
+from zsched.link.sessions.config import local_config
 from zsched.relay.streams import outlet
 from zsched.relay.streams.inputs import InputStream
 from zsched.relay.streams.outputs import OutputStream
-from zsched.sessions.config import local_config
-from zsched.wire.keyspace import END_CHUNK
 
 SENSORS = ("front/scan", "rear/scan", "imu")
 

@@ -15,13 +15,13 @@ import pytest
 import zenoh
 
 from support.waiting import free_endpoint, until
+from zsched.core.values import codec as wire
 from zsched.core.values.plan import Role, WorkerRole
-from zsched.sessions.config import data_config, worker_config
+from zsched.link.keyspace import Keyspace
+from zsched.link.sessions.config import data_config, worker_config
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid
-from zsched.wire import codec as wire
-from zsched.wire.keyspace import Keyspace
 
 _FLEET, _TASK = "test", "map_merge"
 _KEYS = Keyspace(_FLEET)

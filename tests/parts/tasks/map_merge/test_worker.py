@@ -17,9 +17,7 @@ import zenoh
 
 from support.sessions import matches
 from support.waiting import free_endpoint, until
-from zsched.adapters.relay.streams import RelayHandle
-from zsched.core.events import SlotFlipped, SlotReady
-from zsched.core.relay_protocol import HandleReport
+from zsched.core.values.events import SlotFlipped, SlotReady
 from zsched.core.values.plan import (
     Direction,
     Role,
@@ -32,7 +30,9 @@ from zsched.core.values.plan import (
     WorkerRole,
 )
 from zsched.core.values.plan import ReadyWhen as Ready
-from zsched.sessions.config import data_config, worker_config
+from zsched.core.values.relay_protocol import HandleReport
+from zsched.link.sessions.config import data_config, worker_config
+from zsched.runtime.relay.streams import RelayHandle
 from zsched.tasks.map_merge.cdr import decode_grid, decode_transforms, encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import Grid

@@ -6,12 +6,12 @@ import math
 
 from support.fleet_values import fleet_value_of
 from support.fleets import fleet_of
-from zsched.core import instructions as do
 from zsched.core.electorate.documents import FETCH_EVERY_S, MAX_WANTED, Documents
-from zsched.core.events import DocumentRefused
-from zsched.core.todo import ToDo
+from zsched.core.values import instructions as do
+from zsched.core.values.events import DocumentRefused
 from zsched.core.values.problems import Problem
 from zsched.core.values.struct import replace
+from zsched.core.values.todo import ToDo
 
 VALUE = fleet_value_of()
 

@@ -11,15 +11,14 @@ import pytest
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed, under
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate import orders
 from zsched.core.electorate.changes import AdoptDocument, SetDocument, SetLease
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
 from zsched.core.electorate.orders import MAX_OPEN, MAX_STORY, document_change
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.change import RoundOutcome, told_end
 from zsched.core.values.document import Document, Flag, FlagKind, Rollout, Text
 from zsched.core.values.electorate import FleetValue
@@ -40,6 +39,7 @@ from zsched.core.values.messages import (
 )
 from zsched.core.values.model import Acceptance, Asked, Ballot, RegisterState
 from zsched.core.values.problems import Problem
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import MAX_ASKED, MAX_ASKER
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 

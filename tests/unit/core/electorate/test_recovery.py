@@ -24,13 +24,13 @@ from zsched.core.electorate.recovery import (
     rejoined,
     sides_of,
 )
+from zsched.core.values.codec import decode_state, encode_state
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Acceptance, Allocation, Ballot, RegisterState
 from zsched.core.values.snapshot import SCHEMA, QuorumStatus, Snapshot
 from zsched.core.values.words import CREATION_STEP
-from zsched.wire.codec import decode_state, encode_state
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")
 ROBOTS = NAMES[1:]

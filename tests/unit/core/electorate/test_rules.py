@@ -13,12 +13,12 @@ import pytest
 from support.fleet_values import fleet_value_of
 from zsched.core.electorate.changes import AddElector, FleetChange, RemoveElector, SetDocument, SetLease, Settle
 from zsched.core.electorate.founding import founded, recovered
-from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.electorate import Creation, Elector, FleetValue
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import Allocation
+from zsched.core.values.todo import ToDo
 from zsched_lab.sim.chosen import ChosenError
 from zsched_lab.sim.electors import Ask, AskRoll, Machine, Machines, Message, Say, SayRoll
 

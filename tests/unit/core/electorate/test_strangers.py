@@ -12,16 +12,15 @@ from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from support.todos import agreed
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AdoptDocument
 from zsched.core.electorate.founding import founded, recovered
 from zsched.core.electorate.recovery import MOVED, Found, Recovery, consider, rejoined, sides_of
 from zsched.core.electorate.strangers import KEPT, SHOWN_S, Strangers
 from zsched.core.membership.knocking import SHOWN_AFTER_S
-from zsched.core.node import Node
-from zsched.core.status import build_snapshot
-from zsched.core.todo import ToDo
+from zsched.core.node.node import Node
+from zsched.core.node.status import build_snapshot
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.durable import DurableState
 from zsched.core.values.electorate import FleetValue
@@ -29,6 +28,7 @@ from zsched.core.values.fleet import Fleet
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Accept, Learnt, Prepare
 from zsched.core.values.model import Acceptance, Allocation, Ballot, PeerState, Proposal, RegisterState
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.agreement import Agreement
 
 NAMES = ("edge1", "robot1", "robot2", "robot3")

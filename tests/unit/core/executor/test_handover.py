@@ -13,11 +13,11 @@ from support.allocations import allocation_of
 from support.fleets import task_of
 from support.todos import done
 from zsched.core.executor.handover import BEGUN_S, HEARS_S, LEAVES_S, MAX_OLD, ROLE_DRAIN_MARGIN_S, Executor, Phase
-from zsched.core.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import OnIsolation, Standby, StreamRule, TaskSpec, WorkerSpec
+from zsched.core.values.instructions import ApplyRoutes, Instruction, RecordStory, SetRole, StartWorker, StopWorker
 from zsched.core.values.model import Allocation
 from zsched.core.values.plan import Direction, DrainingSlot, RoutePlan, WorkerRole
+from zsched.core.values.todo import ToDo
 
 T = TypeVar("T")
 SPEC = task_of(

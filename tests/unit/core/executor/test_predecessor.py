@@ -6,8 +6,8 @@ from support.allocations import allocation_of
 from support.fleets import task_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
-from zsched.core.instructions import Instruction, SetRole
 from zsched.core.values.fleet import WorkerSpec
+from zsched.core.values.instructions import Instruction, SetRole
 from zsched.core.values.plan import Role, WorkerRole
 
 

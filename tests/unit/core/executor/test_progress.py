@@ -13,16 +13,16 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import profile_of
 from support.states import state_of
 from support.todos import todo_of
-from zsched.core import events as ev
 from zsched.core.executor.handover import Executor, Phase
 from zsched.core.executor.progress import MARGIN_S, HangWatch
 from zsched.core.executor.rhythm import COUNT_S, Progress
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import Instruction, RecordStory, RestartWorker
-from zsched.core.node import Node
+from zsched.core.node.node import Node
 from zsched.core.scheduler.probation import LIMIT_S
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import StreamRule, TaskSpec, WorkerSpec, electorate_hash
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import Instruction, RecordStory, RestartWorker
 from zsched.core.values.model import RegisterState
 from zsched.core.values.plan import Direction, StreamCount
 from zsched.core.values.profile import Profile, TaskProgress, WorkerState

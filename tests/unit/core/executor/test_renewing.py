@@ -11,11 +11,11 @@ from support.allocations import allocation_of
 from support.fleets import task_of
 from support.profiles import load_of, profile_of
 from zsched.core.executor.renewing import GIVE_AWAY_S, OTHER_FILE_S, SAME_FILE_S, Renewing, Step, step
-from zsched.core.instructions import RecordStory, RenewWorker
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, WorkerSpec
+from zsched.core.values.instructions import RecordStory, RenewWorker
 from zsched.core.values.model import Allocation, NodeId
 from zsched.core.values.profile import Profile, Renewal, WorkerState
+from zsched.core.values.todo import ToDo
 
 SPEC = task_of("merge", ("edge1", "edge2", "edge3"), worker=WorkerSpec(command=("work",)))
 OWNED = allocation_of(3, "edge2", task="merge")

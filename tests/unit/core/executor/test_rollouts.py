@@ -11,14 +11,14 @@ import pytest
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.storm import ELECTORATE
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.executor.rollouts import Rollouts, waiting
-from zsched.core.node import Node
-from zsched.core.status import build_snapshot
+from zsched.core.node.node import Node
+from zsched.core.node.status import build_snapshot
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
+from zsched.core.values.codec import decode, document_hash, encode
 from zsched.core.values.document import MAX_HELD_BYTES, Document, Rollout, Text
 from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec, WorkerSpec, file_hash, fleet_hash
-from zsched.wire.codec import decode, document_hash, encode
 
 OLD, NEW = ("merge", "--old"), ("merge", "--new")
 ENV = (("GAIN", "1"),)

@@ -12,13 +12,13 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.sealing import ASK_EVERY_S, Sealing
-from zsched.core.todo import ToDo
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import SetLeased
 from zsched.core.values.fleet import Fleet, TaskSpec, WorkerSpec, fleet_hash, lease_terms
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import Learnt
 from zsched.core.values.model import Allocation
+from zsched.core.values.todo import ToDo
 
 NAMES = ("e1", "e2", "e3")
 TUNING = tuning_of(cpu=1.0, memory=0.0)

@@ -14,11 +14,11 @@ from support.todos import done
 from zsched.core.executor.handover import Executor
 from zsched.core.executor.tenure import ALONE_AFTER_S, Tenure
 from zsched.core.membership.peers import Membership
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Fleet, OnIsolation
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId
 from zsched.core.values.plan import WorkerRole
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.lease import Leases
 
 LOCAL = fleet_of(task_of(on_isolation=OnIsolation.LOCAL))

@@ -7,8 +7,8 @@ import pytest
 from support.fleets import task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
-from zsched.core.instructions import StartWorker
 from zsched.core.values.fleet import OnIsolation, WorkerSpec
+from zsched.core.values.instructions import StartWorker
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from support.fleets import fleet_of, task_of
-from zsched.core import events as ev
 from zsched.core.executor.workers import TROUBLE_S, Workers
+from zsched.core.values import events as ev
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import MAX_REASON
 from zsched.core.values.profile import WorkerState

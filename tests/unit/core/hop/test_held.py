@@ -5,7 +5,7 @@ from __future__ import annotations
 from zsched.core.hop.held import Done, Held, HeldInputs
 from zsched.core.hop.receiver import MAX_SOURCES
 from zsched.core.hop.shared import SharedSender
-from zsched.core.relay_protocol import StreamAck
+from zsched.core.values.relay_protocol import StreamAck
 
 RELAY = "aa1"
 NAME, BESIDE = ("edge1/t/robot1/in", RELAY, 7), ("edge1/t/robot1/beside", RELAY, 8)

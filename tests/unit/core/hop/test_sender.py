@@ -9,7 +9,7 @@ import pytest
 from zsched.core.hop.kept import NOTHING, RESEND_S, Owed
 from zsched.core.hop.sender import GREET_S, KEPT_BYTES_LATEST, MAX_GREET_S, MAX_RESEND_S, Sender, Sums, near
 from zsched.core.hop.serial import SPAN, serial_of
-from zsched.core.relay_protocol import StreamAck
+from zsched.core.values.relay_protocol import StreamAck
 from zsched.relay.streams.tally import Tally
 
 

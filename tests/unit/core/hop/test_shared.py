@@ -18,7 +18,7 @@ from zsched.core.hop.shared import (
     TICK_S,
     SharedSender,
 )
-from zsched.core.relay_protocol import EndMarker, StreamAck
+from zsched.core.values.relay_protocol import EndMarker, StreamAck
 
 
 def sender(count: int = 0, limit: int = 100, *, first: int = 0, is_whole: bool = True) -> SharedSender:

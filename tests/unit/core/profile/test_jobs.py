@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsched.core.events import WorkerJobs
 from zsched.core.profile.jobs import MAX_AT_ONCE, QUEUE_S, UNENDED_S, JobMeter
 from zsched.core.profile.means import STALE_S
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.profile import Jobs
 
 LOOK_S = 0.2

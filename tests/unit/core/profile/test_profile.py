@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from support.profiles import load_of
-from zsched.core.events import WorkerJobs
 from zsched.core.profile.means import STALE_S, Ewma
 from zsched.core.profile.profile import (
     GAUGE_SMOOTHING_S,
@@ -17,6 +16,7 @@ from zsched.core.profile.profile import (
     Profiler,
     SignalFilter,
 )
+from zsched.core.values.events import WorkerJobs
 from zsched.core.values.fleet import Timing
 from zsched.core.values.model import RSSI_MAX_DBM, RSSI_MIN_DBM
 from zsched.core.values.profile import DeviceSample, Link, LinkSample, LinkSource, Profile, WorkerLoad, WorkerState

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from zsched.core.events import RelayChanged
 from zsched.core.profile.relay_ends import DOWN_TOLD_S, OFTEN, WINDOW_S, RelayEnds
+from zsched.core.values.events import RelayChanged
 from zsched.core.values.model import MAX_REASON
 
 UP = RelayChanged(is_running=True, reason="pid 7")

@@ -35,10 +35,10 @@ from support.registers import (
 )
 from zsched.core.register.register import BACKOFF_CAP_S, MAX_JUMP, MAX_REVISION
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.change import RoundOutcome
 from zsched.core.values.messages import Accepted, Prepare, Promise, Refusal, Refused
 from zsched.core.values.model import MAX_COUNTER, Acceptance
+from zsched.core.values.todo import ToDo
 
 # --- acceptor --------------------------------------------------------------------------------------------------------
 

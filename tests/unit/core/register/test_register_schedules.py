@@ -16,12 +16,12 @@ import pytest
 from support.ballots import ballot_of
 from support.registers import BALLOT_S, INITIAL, TUNING, Step, accepted, did, promised
 from zsched.core.register.task_register import TaskRegister
-from zsched.core.todo import ToDo
 from zsched.core.values.change import Change, MoveOwner, Retune, RoundOutcome
 from zsched.core.values.fleet import Timing
 from zsched.core.values.messages import Accept, Accepted, Prepare, Promise, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
 from zsched.core.values.quorum import majority
+from zsched.core.values.todo import ToDo
 
 FAULTS_END_S = 3.0
 Message = Prepare | Accept | Promise | Accepted | Refused | Allocation

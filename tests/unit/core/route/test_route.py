@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, task_of
-from zsched.core.relay_protocol import WorkerWatch
 from zsched.core.route.route import plan_for, slot_for, watch_for
 from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.plan import (
@@ -19,6 +18,7 @@ from zsched.core.values.plan import (
     StreamClass,
     StreamSettings,
 )
+from zsched.core.values.relay_protocol import WorkerWatch
 
 SETTINGS = StreamSettings(stream_class=StreamClass.RELIABLE, depth=7, handover=HandoverRule.ALL)
 SPEC = task_of(

@@ -17,12 +17,12 @@ from support.fleets import fleet_of, task_of, tuning_of
 from support.plays import FLEET
 from support.profiles import load_of, profile_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
+from zsched.core.values.codec import as_plain, from_plain
 from zsched.core.values.decision import Decision
+from zsched.core.values.errors import InvariantError
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.model import NodeId, ScoreForm, TaskId, Utility, UtilityVector
 from zsched.core.values.profile import WorkerState
-from zsched.errors import InvariantError
-from zsched.wire.codec import as_plain, from_plain
 from zsched_lab.sim.checks import check_replayed
 from zsched_lab.sim.simulator import Simulator
 

@@ -10,7 +10,6 @@ from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import vector_of
-from zsched.core.absence import Absences
 from zsched.core.scheduler.fuse import Fuse
 from zsched.core.scheduler.judge import (
     FIT_S,
@@ -22,6 +21,7 @@ from zsched.core.scheduler.judge import (
     escape_reason,
 )
 from zsched.core.scheduler.standing import LOST_S, Standing, compare
+from zsched.core.values.absence import Absences
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
 from zsched.core.values.profile import Profile, WorkerState

@@ -8,15 +8,15 @@ from random import Random
 import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
-from zsched.core.handlers.beats import on_transition
 from zsched.core.membership.peers import Transition
-from zsched.core.node import Node
+from zsched.core.node.beats import on_transition
+from zsched.core.node.node import Node
 from zsched.core.scheduler.probation import LEASE_MARGIN_S, LIMIT_S, Probation
-from zsched.core.todo import ToDo
 from zsched.core.values.fleet import Standby, TaskSpec, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState
 from zsched.core.values.plan import ReadyWhen
+from zsched.core.values.todo import ToDo
 
 TASK = task_of(tuning=tuning_of(cpu=1.0, memory=0.0), worker=WorkerSpec(command=("true",)))
 FLEET = fleet_of(TASK, of=TASK.candidates, electors=("edge1",))

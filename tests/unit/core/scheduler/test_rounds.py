@@ -14,13 +14,13 @@ from support.profiles import load_of, profile_of
 from support.proposals import proposal_of, vector_of
 from support.robots import Decider
 from zsched.core.gateway.gateway import Gateway
-from zsched.core.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.scheduler.claims import taken
 from zsched.core.scheduler.judge import Outcome
 from zsched.core.scheduler.ledger import AHEAD_S
 from zsched.core.scheduler.rounds import TaskRound
 from zsched.core.values.fleet import Demand, Fleet, WorkerSpec
 from zsched.core.values.in_force import InForce
+from zsched.core.values.instructions import AskUtilities, Instruction, PublishProposal
 from zsched.core.values.messages import Utilities
 from zsched.core.values.model import Allocation, Asked, PeerState, Pin
 from zsched.core.values.profile import WorkerState

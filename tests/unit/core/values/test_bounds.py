@@ -15,7 +15,12 @@ from support.fleets import tuning_of
 from support.profiles import load_of, profile_of
 from support.proposals import proposal_of
 from support.states import state_of
-from zsched.core.events import (
+from zsched.core.values import model
+from zsched.core.values.beat import Grant
+from zsched.core.values.change import SetHold, SetLeased
+from zsched.core.values.document import MAX_DOCUMENT_BYTES, MAX_FLAGS, Document, Flag, FlagKind, Text
+from zsched.core.values.electorate import Creation, Elector
+from zsched.core.values.events import (
     CertificateSent,
     ExplanationAsked,
     FleetCommanded,
@@ -32,12 +37,6 @@ from zsched.core.events import (
     WorkerJobs,
     commanded,
 )
-from zsched.core.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
-from zsched.core.values import model
-from zsched.core.values.beat import Grant
-from zsched.core.values.change import SetHold, SetLeased
-from zsched.core.values.document import MAX_DOCUMENT_BYTES, MAX_FLAGS, Document, Flag, FlagKind, Text
-from zsched.core.values.electorate import Creation, Elector
 from zsched.core.values.fleet import Demand
 from zsched.core.values.messages import (
     Accept,
@@ -97,6 +96,7 @@ from zsched.core.values.rehearsal import (
     Step,
     Strike,
 )
+from zsched.core.values.relay_protocol import EndMarker, SnapshotChunk, StreamAck, WorkerTrouble
 from zsched.core.values.words import MAX_ASKED, MAX_ASKER
 
 TUNING = tuning_of(score=ScoreForm.SERVICE)

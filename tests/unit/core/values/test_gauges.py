@@ -8,16 +8,16 @@ import pytest
 
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import profile_of
-from zsched.commands.common import SCHEMAS
+from zsched.commands.base.common import SCHEMAS
 from zsched.core.values import gauges
+from zsched.core.values.codec import as_plain, from_plain
+from zsched.core.values.errors import WireError
 from zsched.core.values.fleet import Demand, fleet_hash
 from zsched.core.values.gauges import BY_NAME, GAUGES
 from zsched.core.values.model import Tuning, Weights
 from zsched.core.values.profile import Profile
-from zsched.errors import WireError
-from zsched.wire.codec import as_plain, from_plain
 
-READERS = Path(gauges.__file__).parents[2] / "adapters" / "machine" / "gauges"
+READERS = Path(gauges.__file__).parents[2] / "host" / "machine" / "gauges"
 
 
 def test_the_worked_examples_in_the_docstrings_hold() -> None:
@@ -31,7 +31,7 @@ def test_a_gauge_is_one_row_and_one_file() -> None:
     files = {file.stem for file in READERS.glob("*.py")} - {"__init__"}
     assert files == set(BY_NAME)
     for name in BY_NAME:
-        assert importlib.import_module(f"zsched.adapters.machine.gauges.{name}").Reader
+        assert importlib.import_module(f"zsched.host.machine.gauges.{name}").Reader
     assert f"^({'|'.join(BY_NAME)})$" in (SCHEMAS / "zsched.tuning.1.json").read_text()
 
 

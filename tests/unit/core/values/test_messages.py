@@ -9,7 +9,6 @@ from inspect import Parameter, signature
 import pytest
 
 from support.allocations import allocation_of
-from zsched.core.relay_protocol import EndMarker
 from zsched.core.values import messages
 from zsched.core.values.messages import (
     Accept,
@@ -24,6 +23,7 @@ from zsched.core.values.messages import (
     votes_of,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot
+from zsched.core.values.relay_protocol import EndMarker
 from zsched.core.values.struct import Struct
 
 BALLOT = Ballot(counter=1, node="r1", incarnation=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from support.fleets import tuning_of
+from zsched.core.values.codec import as_plain, from_plain
 from zsched.core.values.snapshot import SCHEMA, Snapshot
-from zsched.wire.codec import as_plain, from_plain
 
 
 def test_what_an_older_program_does_not_tell_is_read_as_nothing() -> None:

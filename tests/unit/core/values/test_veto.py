@@ -11,11 +11,11 @@ from zsched.core.scheduler.eligibility import CHAIN, Case, Doubts, chain_of, vet
 from zsched.core.scheduler.judge import escape_reason
 from zsched.core.scheduler.standing import Standing, compare
 from zsched.core.scheduler.usage import Use
+from zsched.core.values.codec import as_plain, from_plain
 from zsched.core.values.fleet import WorkerSpec
 from zsched.core.values.model import PeerState, UtilityVector
 from zsched.core.values.profile import WorkerState
 from zsched.core.values.veto import Filter, Veto, read
-from zsched.wire.codec import as_plain, from_plain
 
 SPEC = task_of(worker=WorkerSpec(command=("worker",)))
 VECTOR = UtilityVector(voter="robot1", task="merge", revision=1, utilities=())

@@ -14,11 +14,10 @@ from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.states import state_of
 from support.todos import agreed, under
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.strangers import SHOWN_S
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat
 from zsched.core.values.change import MoveOwner, Retune, SetHold, SetLeased
 from zsched.core.values.fleet import Fleet
@@ -35,6 +34,7 @@ from zsched.core.values.messages import (
     Refused,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Allocation, Asked, Pause, RegisterState
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD, MAX_GENERATION
 from zsched.core.vote.questions import ASK_AT_ONCE_S, ASK_LEARNT_EVERY_S, READ_EVERY_S

@@ -15,11 +15,10 @@ from support.fleet_values import fleet_value_of
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument
 from zsched.core.electorate.founding import founded
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.electorate import Elector, FleetValue
 from zsched.core.values.in_force import InForce
 from zsched.core.values.messages import (
@@ -36,6 +35,7 @@ from zsched.core.values.messages import (
     votes_of,
 )
 from zsched.core.values.model import Acceptance, RegisterState
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.acceptor import PREPARE_BURST
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.joining import joined

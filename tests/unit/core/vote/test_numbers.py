@@ -17,14 +17,14 @@ from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed, under
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.electorate.changes import AddElector, AdoptDocument, RemoveElector, SetDocument, SetLease
 from zsched.core.electorate.founding import founded
 from zsched.core.register.register import MAX_REVISION
-from zsched.core.todo import ToDo
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat, Grant
 from zsched.core.values.change import MoveOwner
+from zsched.core.values.codec import decode_state, encode_state
 from zsched.core.values.electorate import Creation, FleetValue
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.in_force import InForce
@@ -42,12 +42,12 @@ from zsched.core.values.messages import (
     fleet_answer,
 )
 from zsched.core.values.model import NO_BALLOT, Acceptance, Ballot, RegisterState
+from zsched.core.values.todo import ToDo
 from zsched.core.values.words import CREATION_STEP
 from zsched.core.vote.agreement import Agreement
 from zsched.core.vote.belief import GENERATION_STEP, MAX_AHEAD
 from zsched.core.vote.lease import Leases
 from zsched.core.vote.questions import ASK_LEARNT_EVERY_S
-from zsched.wire.codec import decode_state, encode_state
 
 T = TypeVar("T")
 NAMES = ("edge1", "robot1", "robot2", "robot3")

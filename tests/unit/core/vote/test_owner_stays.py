@@ -8,8 +8,8 @@ from support.allocations import allocation_of
 from support.fleets import task_of, tuning_of
 from support.todos import done
 from zsched.core.executor.handover import Executor
-from zsched.core.instructions import ApplyRoutes, SetRole, StartWorker
 from zsched.core.values.fleet import OnIsolation, WorkerSpec
+from zsched.core.values.instructions import ApplyRoutes, SetRole, StartWorker
 from zsched.core.values.plan import Role, WorkerRole
 
 TUNING = tuning_of(cpu=1.0, memory=0.0)

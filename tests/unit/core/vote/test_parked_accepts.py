@@ -12,16 +12,16 @@ from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from support.states import state_of
 from support.todos import agreed
-from zsched.core import events as ev
-from zsched.core import instructions as do
-from zsched.core.node import Node
-from zsched.core.todo import ToDo
+from zsched.core.node.node import Node
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
 from zsched.core.values.change import MoveOwner
 from zsched.core.values.durable import DurableState
 from zsched.core.values.in_force import InForce
 from zsched.core.values.lease import hold_s
 from zsched.core.values.messages import Accept, Accepted, Learnt, Refusal, Refused
 from zsched.core.values.model import Acceptance, Allocation, RegisterState
+from zsched.core.values.todo import ToDo
 from zsched.core.vote.acceptor import PARK_SHARE
 from zsched.core.vote.agreement import Agreement
 

@@ -1,4 +1,4 @@
-"""The offline replay decides as full nodes do: the same history, played to a simulated fleet of `zsched.core.node`."""
+"""The offline replay decides as full nodes do: the same history, played to a fleet of `zsched.core.node.node`."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.explore.agent import Agent, RobotSettings
 from zsched_lab.explore.body import Limits

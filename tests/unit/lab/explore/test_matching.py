@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.explore.body import Body, Drift, Limits, Twist
 from zsched_lab.explore.laser import Laser, LaserScan

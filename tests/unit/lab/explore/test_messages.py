@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from zsched.errors import WireError
+from zsched.core.values.errors import WireError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.explore.frontier import Claim
 from zsched_lab.explore.laser import RANGE_M, LaserScan

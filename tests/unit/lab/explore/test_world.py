@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED
 from zsched_lab.explore.office import OfficeSize, office
 from zsched_lab.explore.world import START_CLEARANCE_M, START_SPACING_M, make_world, read_map_server, shipped

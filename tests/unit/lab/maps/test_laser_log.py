@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.maps.laser_log import LaserLog, load_log, malaga_path, split_log
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsched.adapters.radio.network_profiler import Trace
 from zsched.core.values.fleet import Timing
+from zsched.host.radio.network_profiler import Trace
 from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from zsched.config.load import load_fleet
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
 from zsched_lab.explore.navigate import main as navigate
 from zsched_lab.explore.robot import parse as parse_explorer
 from zsched_lab.explore.slam import main as slam

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.exits import EXIT_USAGE
+from zsched.core.values.exits import EXIT_USAGE
 from zsched_lab.paper.bench import BenchOptions, run_bench
 from zsched_lab.paper.places import robots_scenario_path, scenario_path
 from zsched_lab.paper.published import RESULTS, made_by

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from zsched.clock import monotonic_s
 from zsched.config.load import load_fleet
+from zsched.host.clock import monotonic_s
 from zsched_lab.explore.robot import parse as parse_explorer
 from zsched_lab.fleet.children import Children
 from zsched_lab.fleet.limits import LimitKind, NodeLimits

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from zsched.adapters.radio.network_profiler import parse_trace
 from zsched.config.load import load_fleet
+from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import DEFAULT_BONUS
 from zsched.core.values.model import ScoreForm
-from zsched.errors import ConfigError
+from zsched.host.radio.network_profiler import parse_trace
 from zsched_lab.fleet.runner import read_tree, write_fleet
 from zsched_lab.paper.claims import CLAIMS
 from zsched_lab.paper.load import Window, loaded_at, schedule

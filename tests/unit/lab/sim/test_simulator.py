@@ -11,15 +11,15 @@ from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of
 from zsched.config.timing import WIRED
-from zsched.core import events as ev
-from zsched.core import instructions as do
 from zsched.core.executor.tenure import Tenure
 from zsched.core.membership.pace import FULL_S
+from zsched.core.values import events as ev
+from zsched.core.values import instructions as do
+from zsched.core.values.errors import InvariantError
 from zsched.core.values.fleet import StreamRule, WorkerSpec
 from zsched.core.values.messages import Accepted, CommandOutcome, MoveTask, Promise
 from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, NodeId, PeerState
 from zsched.core.values.plan import Direction, Role, StreamCount, WorkerRole
-from zsched.errors import InvariantError
 from zsched_lab.sim.simulator import RESTART_S, TOKEN_DELAY_S, Simulator
 
 RULE = StreamRule(direction=Direction.INPUT, from_template="{robot}/map", to_template="{target}/merge/{robot}/map")

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 from zsched.core.hop.serial import serial_of
-from zsched.core.relay_protocol import EndMarker
-from zsched.hop.acknowledger import Acknowledger
+from zsched.core.values.relay_protocol import EndMarker
+from zsched.link.acknowledger import Acknowledger
 from zsched.relay.streams import answers as answers_module
 from zsched.relay.streams import slots
 from zsched.relay.streams.answers import Answers

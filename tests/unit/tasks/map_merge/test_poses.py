@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.errors import ConfigError
+from zsched.core.values.errors import ConfigError
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.poses import read_poses
 

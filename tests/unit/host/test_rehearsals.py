@@ -1,0 +1,34 @@
+"""Rehearsals on disk: kept by name, bounded in number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from zsched.core.values.errors import AdapterError
+from zsched.host.rehearsals import MAX_KEPT, RehearsalStore
+
+
+def test_the_newest_are_kept_and_read_again(tmp_path: Path) -> None:
+    store = RehearsalStore(tmp_path)
+    assert (store.names(), store.load("20260101-000000")) == ((), "")
+    for number in range(MAX_KEPT + 3):
+        store.save(f"20260101-0000{number:02d}", f'{{"n": {number}}}')
+    assert len(store.names()) == MAX_KEPT
+    assert store.names()[0] == "20260101-000003", "the oldest go"
+    assert store.load(store.names()[-1]) == f'{{"n": {MAX_KEPT + 2}}}'
+
+
+@pytest.mark.parametrize("name", ["../state", "", "A b"])
+def test_a_name_is_no_path(tmp_path: Path, name: str) -> None:
+    store = RehearsalStore(tmp_path)
+    for call in (lambda: store.load(name), lambda: store.save(name, "{}")):
+        with pytest.raises(ValueError, match="rehearsal"):
+            call()
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "rehearsals").write_text("a file")
+    with pytest.raises(AdapterError, match="cannot keep the rehearsal in"):
+        RehearsalStore(tmp_path).save("1", "{}")

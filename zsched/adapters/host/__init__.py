@@ -1,1 +1,0 @@
-"""The service manager, the state file, the operator's socket."""

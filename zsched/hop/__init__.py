@@ -1,1 +1,0 @@
-"""Numbered, acknowledged streams."""

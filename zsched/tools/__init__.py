@@ -1,0 +1,1 @@
+"""Behind a wall: what no daemon needs. The rest of zsched imports nothing from here."""

@@ -1,1 +1,0 @@
-"""What travels between daemons: frames and keys."""
