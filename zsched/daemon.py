@@ -36,11 +36,11 @@ from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.problems import Problem
 from zsched.core.values.snapshot import Exposure
 from zsched.core.values.struct import Struct
-from zsched.host.document_store import copied_file
 from zsched.host import paths as places
 from zsched.host import zenoh_log
 from zsched.host.clock import SleepWatch, monotonic_s
 from zsched.host.decision_log import DecisionLog
+from zsched.host.document_store import copied_file
 from zsched.host.guard import calmed, end_with, on_failure
 from zsched.host.heap import Leftovers, give_back, share_heaps
 from zsched.host.log_limit import log_to_stderr

@@ -16,8 +16,8 @@ import pytest
 import zenoh
 
 from support.authorities import install, secured
-from zsched.commands.base.change import user_name
 from zsched.commands.base.ask import Door, _client, _visit, ask_door
+from zsched.commands.base.change import user_name
 from zsched.config.load import load_fleet
 from zsched.core.values import codec as wire
 from zsched.core.values.certificates import Role

@@ -14,7 +14,7 @@ from support.proposals import vector_of
 from zsched.core.scheduler.standing import Standing, compare, pick
 from zsched.core.scheduler.utility import cpu_utility, memory_utility, network_utility, predicted_use
 from zsched.core.values.fleet import LinkLimits
-from zsched.core.values.model import Aggregate, Reach, Tuning, Weights
+from zsched.core.values.model import Reach, Tuning, Weights
 
 ALL = frozenset({"cpu", "memory", "network"})
 LIMITS = LinkLimits()
@@ -121,10 +121,9 @@ def test_eq4_a_metric_absent_for_one_candidate_only_is_not_guessed() -> None:
 SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=tuning_of(cpu=1.0, memory=0.0))
 
 
-def joint(rows: dict[str, dict[str, float]], aggregate: Aggregate = Aggregate.MEAN) -> Standing:
+def joint(rows: dict[str, dict[str, float]]) -> Standing:
     """The standing of {robot: {candidate: utility}}; a negative utility stands for unreachable."""
-    tuning = Tuning(weights=SPEC.tuning.weights, aggregate=aggregate)
-    allocation = allocation_of(tuning=tuning)
+    allocation = allocation_of(tuning=Tuning(weights=SPEC.tuning.weights))
     vectors = {robot: vector_of(robot, row, 1) for robot, row in rows.items()}
     return compare(SPEC, allocation, vectors)
 
@@ -172,16 +171,6 @@ def test_eq3_a_candidate_that_no_majority_reaches_cannot_be_offloaded_to() -> No
     assert pick(joint(rows).aggregates, None) == "edge2"
     assert str(joint(rows).vetoed["edge1"]) == "reached by 1 of 3 robots"
     assert SPEC.reach is Reach.MAJORITY
-
-
-def test_eq5_median_withstands_one_robot_of_three_that_is_wrong() -> None:
-    """Reading for robustness: one broken or lying robot does not decide; with the sum it would."""
-    rows = {**MATRIX, "robot3": {"edge1": 0.0, "edge2": 0.0, "edge3": 1.0}}
-    liar = {name: {"edge1": 0.5, "edge2": 0.6, "edge3": 0.3} for name in ("robot1", "robot2")}
-    liar["robot3"] = rows["robot3"]
-
-    assert pick(joint(liar).aggregates, None) == "edge3"
-    assert pick(joint(liar, Aggregate.MEDIAN).aggregates, None) == "edge2"
 
 
 def test_constraint_weights_lie_in_zero_to_one() -> None:

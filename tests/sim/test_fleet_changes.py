@@ -14,7 +14,7 @@ from zsched.core.electorate.documents import Documents
 from zsched.core.values import events as ev
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import ChangeFleet, CommandOutcome, TuneTask
-from zsched.core.values.model import Aggregate, Asked
+from zsched.core.values.model import Asked, ScoreForm
 from zsched.core.values.words import CREATION_STEP
 from zsched_lab.sim import fleets
 
@@ -170,11 +170,11 @@ def test_two_changes_of_settings_one_after_the_other_are_both_agreed() -> None:
         play.sim.crash(name)
     play.sim.run_until(lambda: False, 5)
     one = tuned(FLEET, bonus=0.2)
-    for said in (one, tuned(one, aggregate=Aggregate.MEDIAN)):
+    for said in (one, tuned(one, score=ScoreForm.SERVICE)):
         assert play.told("robot1", ChangeFleet(document=play.document(said))).outcome is CommandOutcome.OK
     play.sim.run_until(lambda: False, 10)
     tunings = [play.sim.node(name).values()[TASK].tuning for name in play.sim.running()]
-    assert {(one.bonus, one.aggregate) for one in tunings} == {(0.2, Aggregate.MEDIAN)}
+    assert {(one.bonus, one.score) for one in tunings} == {(0.2, ScoreForm.SERVICE)}
 
 
 def test_a_fleet_that_gets_the_clocks_of_slow_links_is_changed_over_slow_links() -> None:

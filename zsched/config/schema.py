@@ -51,10 +51,8 @@ from zsched.core.values.model import (
     MIN_DEADLINE_MS,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
-    Aggregate,
     NodeKind,
     Objective,
-    PairReading,
     ScoreForm,
 )
 from zsched.core.values.plan import ServiceSettings, StreamSettings
@@ -247,11 +245,6 @@ SCHEDULING: Final = Record(
             "For `objective: latency`: the time of a job, network included; for workers with the library.",
             default="none",
         ),
-        "aggregate": Field(
-            Choice.of(Aggregate),
-            "How the robots' words become one worth; `median` resists a liar.",
-            default=f"`{Aggregate.MEAN}`",
-        ),
         "prefer": Field(
             MapOf(Text("a node, or KEY=VALUE of a label"), _SHARE),
             "How much more machines are worth: `{edge1: 0.05}`, or `{gpu=yes: 0.1}` by a label.",
@@ -267,15 +260,16 @@ SCHEDULING: Final = Record(
         "patience": "delete it; or price_s: 0.3, what a move costs in seconds of the task's work",
         "cool_down_s": "delete it; where a move is dear: price_s: 2",
         "max_moves_per_minute": "delete it: it is 6",
+        "aggregate": "delete it: it is the mean",
+        "cpu_floor_ratio": "delete it; a program that is no task needs room: demand: {cpu_cores: 1}, or give it a task",
         "memory_floor_ratio": "delete it; what the task needs is kept free: demand: {memory_mb: 2000}",
     },
 )
 
-_PAIR: Final = Choice.of(PairReading)
 LINK_LIMITS: Final = Record(
     "a link section",
-    keys(LinkLimits, pair=_PAIR),
-    removed={"foresee_s": "delete it: signals count as they are"},
+    keys(LinkLimits),
+    removed={"pair": "delete it: the candidate's way counts", "foresee_s": "delete it: signals count as they are"},
 )
 
 WORKER: Final = Record(

@@ -68,7 +68,6 @@ def read_tasks(section: Section, cast: Cast, out: Collector) -> tuple[TaskSpec, 
             tasks.append(task)
             _advise_network(task, entry.value, cast, out)
             _advise_deadline(task.tuning, task.worker, entry.value, out)
-            _advise_cpu_floor(task, entry.value, out)
             _advise_domain(task.worker, entry.value, out)
             _advise_gpu(task, entry.value, out)
             _advise_gpu_limit(task, entry.value, out)
@@ -288,13 +287,6 @@ def _advise_deadline(tuning: Tuning, worker: WorkerSpec, given: Section, out: Co
             TELLS_NOTHING,
             "use zsched.worker (ready: token), or delete objective and deadline_ms",
         )
-
-
-def _advise_cpu_floor(task: TaskSpec, given: Section, out: Collector) -> None:
-    if task.cpu_floor_ratio > 0.0 and task.tuning.score is ScoreForm.PAPER:
-        scheduling: Section = given.get("scheduling")
-        message = "cpu_floor_ratio changes nothing: score: paper counts the free share of the CPU anyway (Eq. 1)"
-        out.warn(scheduling.where("cpu_floor_ratio"), message, "delete it, or delete `score: paper`")
 
 
 def _advise_domain(worker: WorkerSpec, given: Section, out: Collector) -> None:

@@ -13,12 +13,11 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from zsched.config.load import check_bytes, check_file
-from zsched.config.reader import render_all
+from zsched.config.document import TakenOutError, read_document
 from zsched.core.values import events as ev
 from zsched.core.values import instructions as do
 from zsched.core.values.codec import decode_document, document_hash
-from zsched.core.values.document import Document, Rollout
+from zsched.core.values.document import Document
 from zsched.core.values.errors import AdapterError, ConfigError, WireError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import NodeId

@@ -1207,13 +1207,6 @@ VOTE_BUGS = (
         ("tests/unit/core/scheduler/test_ledger.py",),
     ),
     _bug(
-        "median and mean swapped",
-        STANDING,
-        "if aggregate is Aggregate.MEAN",
-        "if aggregate is not Aggregate.MEAN",
-        _SCHEDULER,
-    ),
-    _bug(
         "a call to a vote outlives its value",
         "zsched.core.scheduler.rounds",
         "        task.is_called = task.is_called_escape = False  # a call is to a vote on the value before\n",

@@ -329,7 +329,9 @@ STREAM_BUGS = (
         OUTLET,
         "= acks.stalled if acks else contextlib.nullcontext()",
         "= contextlib.nullcontext()",
-        ("tests/parts/link/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",),
+        (
+            "tests/parts/link/sessions/test_stalled_links.py::test_a_relay_ends_the_link_of_a_frozen_worker_behind_its_put",
+        ),
     ),
     _bug(
         "a relay closes links, and reads those it has dialled, with a single thread",

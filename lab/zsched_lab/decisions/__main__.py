@@ -16,7 +16,7 @@ from zsched_lab.decisions import drives, figures, halls, report, study
 from zsched_lab.decisions.service import command
 
 PARTS = ("compare", "sweep", "options")
-SHOWN = ("zsched by service", "zsched", "the weaker way", "dyna_net", "argmax", "dyna_net_penalty")
+SHOWN = ("zsched by service", "zsched", "dyna_net", "argmax", "dyna_net_penalty")
 
 
 def parse() -> argparse.Namespace:

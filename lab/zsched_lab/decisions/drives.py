@@ -15,8 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from zsched.core.values.fleet import LinkLimits
-from zsched.core.values.model import PairReading, ScoreForm
+from zsched.core.values.model import ScoreForm
 from zsched_lab.decisions import entries
 from zsched_lab.decisions.radio import Drive, read_drive
 from zsched_lab.decisions.replay import Entry, replay
@@ -76,20 +75,9 @@ def cast(world: World) -> tuple[Entry, ...]:
             look=Look(smoothing_s=1.0),
             make=entries.core(world, form=ScoreForm.SERVICE),
         ),
-        Entry(
-            name="the weaker way",
-            limits=LinkLimits(pair=PairReading.WEAKER),
-            make=entries.core(world),
-        ),
         Entry(name="dyna_net", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=entries.PAPER_COST)),
         Entry(name="dyna_net_penalty", look=UNSMOOTHED, make=lambda view: PickRule(view, cost=-entries.PAPER_COST)),
         Entry(name="argmax", look=UNSMOOTHED, make=PickRule),
-        Entry(
-            name="argmax, weaker",
-            look=UNSMOOTHED,
-            limits=LinkLimits(pair=PairReading.WEAKER),
-            make=PickRule,
-        ),
         Entry(name="argmax, every 0.5 s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=0.5)),
         Entry(name="every_25s", look=UNSMOOTHED, make=lambda view: PickRule(view, period_s=25.0)),
         *(entry for entry in entries.schemes(world, 1) if entry.name.startswith("fixed")),

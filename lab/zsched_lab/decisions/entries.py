@@ -13,8 +13,8 @@ from collections.abc import Callable
 from random import Random
 from typing import Final
 
-from zsched.core.values.fleet import DEFAULT_BONUS, LinkLimits
-from zsched.core.values.model import PairReading, ScoreForm, Tuning, Weights
+from zsched.core.values.fleet import DEFAULT_BONUS
+from zsched.core.values.model import ScoreForm, Tuning, Weights
 from zsched_lab.decisions.replay import Entry
 from zsched_lab.decisions.rules import (
     BlindRule,
@@ -102,12 +102,8 @@ def costly(world: World, move_cost_s: float) -> tuple[Entry, ...]:
 
 
 def readings(world: World) -> tuple[Entry, ...]:
-    """Robot to robot through one access point: every reading of a pair, by default, with bonuses, and plain argmax."""
+    """Robot to robot through one access point: by default, with another bonus, and plain argmax."""
     judged = tuple(
-        Entry(name=f"{pair}, zsched, bonus {bonus:g}", limits=LinkLimits(pair=pair), make=core(world, bonus=bonus))
-        for pair, bonus in itertools.product(PairReading, (DEFAULT_BONUS, 0.1))
+        Entry(name=f"zsched, bonus {bonus:g}", make=core(world, bonus=bonus)) for bonus in (DEFAULT_BONUS, 0.1)
     )
-    plain = tuple(
-        Entry(name=f"{pair}, argmax", look=RAW, limits=LinkLimits(pair=pair), make=_pick(0.0)) for pair in PairReading
-    )
-    return judged + plain
+    return (*judged, Entry(name="argmax", look=RAW, make=_pick(0.0)))

@@ -15,7 +15,7 @@ from random import Random
 
 from zsched.config.timing import WAN, WIFI, WIRED
 from zsched.core.values.fleet import Fleet, NodeSpec, OnIsolation, Standby, TaskSpec, WorkerSpec
-from zsched.core.values.model import Aggregate, NodeId, NodeKind, Tuning, Weights
+from zsched.core.values.model import NodeId, NodeKind, Tuning, Weights
 from zsched.core.values.struct import replace
 from zsched_lab.sim.clocks import clock_faults, suspensions
 from zsched_lab.sim.files import CHANGES, RELOADED
@@ -136,7 +136,6 @@ def _task(rng: Random, name: str, voters: tuple[NodeId, ...], edges: tuple[NodeI
         tuning=Tuning(
             weights=Weights(cpu=0.5, memory=0.5, network=0.0),
             bonus=bonus,
-            aggregate=rng.choice(tuple(Aggregate)),
         ),
         price_s=price_s,
         worker=WorkerSpec(command=("work",), standby=Standby.COLD if is_cold else Standby.WARM, start_deadline_s=3.0),

@@ -10,9 +10,9 @@ import pytest
 
 from support.doors import answering
 from support.schemas import faults
-from zsched.commands.base.change import asker, user_name
 from zsched.commands.base import ask
 from zsched.commands.base.ask import ask_door, find_door
+from zsched.commands.base.change import asker, user_name
 from zsched.commands.base.common import CliError, Json
 from zsched.commands.base.options import Answers
 from zsched.commands.look.cells import show_site

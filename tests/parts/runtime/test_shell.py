@@ -62,8 +62,8 @@ from zsched.host.decision_log import DecisionLog
 from zsched.host.state_file import StateFile
 from zsched.host.workers.kept_lines import KeptLines
 from zsched.host.workers.supervisor import WorkerContext, WorkerSupervisor
-from zsched.runtime import shell as shell_module
 from zsched.link.requests import COMMANDS, command_of
+from zsched.runtime import shell as shell_module
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk
 from zsched.runtime.inbox import INBOX_LIMIT, WAITING_LIMIT, Inbox
 from zsched.runtime.library import Library

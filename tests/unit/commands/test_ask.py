@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from zsched.commands.base.change import asker, user_name
 from zsched.commands.base import ask
 from zsched.commands.base.ask import AGAIN_S, Door, ask_door, door_of, find_door
+from zsched.commands.base.change import asker, user_name
 from zsched.commands.base.common import CliError, Json
 from zsched.core.values.errors import AdapterError
 from zsched.core.values.exits import EXIT_CONFIG, EXIT_FAILED, EXIT_UNREACHABLE, EXIT_USAGE

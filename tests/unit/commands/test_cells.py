@@ -12,8 +12,8 @@ from typer.testing import CliRunner, Result
 from zsched.cli import app
 from zsched.commands.base.ask import Door
 from zsched.commands.base.common import CliError
-from zsched.commands.look import cells, history
 from zsched.commands.base.places import Places
+from zsched.commands.look import cells, history
 from zsched.commands.members.belongings import found
 from zsched.core.values.exits import EXIT_UNREACHABLE
 

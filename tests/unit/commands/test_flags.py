@@ -16,8 +16,8 @@ from support.doors import STATUS, answering, living
 from support.schemas import faults
 from zsched.cli import app
 from zsched.commands.act import flags as verbs
-from zsched.commands.base.change import OrderView
 from zsched.commands.base.ask import Door
+from zsched.commands.base.change import OrderView
 from zsched.commands.base.report import render_brief, render_status
 from zsched.host.operator_client import Json
 

@@ -131,7 +131,7 @@ class Daemon:
         self.status: Json = {**STATUS, "fleet": "warehouse", "node": "robot1", "nodes": nodes, "tasks": [task]}
         self.status["fleet_revision"] = 4
         self.task, self.hold = task, hold
-        tuning = {"bonus": 0.1, "aggregate": "mean", "score": "service", "deadline_ms": None}
+        tuning = {"bonus": 0.1, "score": "service", "deadline_ms": None}
         self.task["tuning"] = self.task["file_tuning"] = {
             **tuning,
             "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},

@@ -27,10 +27,10 @@ from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from zsched.cli import app
 from zsched.commands.base.common import CliError
+from zsched.commands.base.places import Places
 from zsched.commands.base.renewing import UNIT_FOLDER, renew_advice
 from zsched.commands.members import belongings as membership_files
 from zsched.commands.members import membership, papers
-from zsched.commands.base.places import Places
 from zsched.commands.members.membership import Address, address_of, dial_order, how_to_start, own_address
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
@@ -40,8 +40,8 @@ from zsched.core.values.errors import ConfigError
 from zsched.core.values.exits import EXIT_WOULD_CHANGE
 from zsched.core.values.fleet import fleet_hash
 from zsched.core.values.struct import replace
-from zsched.host.document_store import copied_file
 from zsched.host import state_file
+from zsched.host.document_store import copied_file
 from zsched.host.operator_socket import OperatorSocket
 from zsched.host.state_file import StateFile
 from zsched.link.invitation import decode_invitation, encode_invitation

@@ -14,8 +14,8 @@ from typer.testing import CliRunner, Result
 from support.doors import STATUS, answering, living
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.base.change import user_name
 from zsched.commands.act.tune import KEYS, tuned
+from zsched.commands.base.change import user_name
 from zsched.commands.base.common import CliError
 from zsched.commands.base.report import render_brief, render_status
 from zsched.core.values.words import CREATION_STEP
@@ -24,7 +24,6 @@ from zsched.host.operator_client import Json
 TUNING: Json = {
     "weights": {"cpu": 0.5, "memory": 0.5, "network": 0.0},
     "bonus": 0.1,
-    "aggregate": "mean",
     "score": "service",
     "deadline_ms": None,
 }
@@ -427,9 +426,9 @@ def test_an_order_that_is_not_agreed_says_so(daemon: Daemon, outcome: str, code:
 
 
 def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> None:
-    assert run("tune", "echo", "bonus=0.3", "aggregate=median", "--yes").exit_code == 0
+    assert run("tune", "echo", "bonus=0.3", "score=paper", "--yes").exit_code == 0
     told = daemon.orders[0]["tuning"]
-    assert (told["bonus"], told["aggregate"], told["weights"]["cpu"]) == (0.3, "median", 0.5)
+    assert (told["bonus"], told["score"], told["weights"]["cpu"]) == (0.3, "paper", 0.5)
     daemon.status["tasks"][0]["tuning"] = {**TUNING, "bonus": 0.3}
     assert "bonus=0.3 (file: 0.1)" in run("tune", "echo").stdout
     body = json.loads(run("tune", "--json").stdout)
@@ -454,11 +453,9 @@ def test_epochs_and_revisions_are_counted_from_1_for_people_and_typed_back(daemo
 OWN: Json = {
     **TUNING,
     "price_s": 0.3,
-    "cpu_floor_ratio": 0.0,
     "reach": "majority",
     "nu_dbm": -80.0,
     "rho_dbm": -40.0,
-    "pair": "candidate",
 }
 
 
@@ -473,7 +470,7 @@ def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemo
         "reach": "all",
         "nu_dbm": -70.0,
     }
-    assert not {"rho_dbm", "pair", "cpu_floor_ratio"} & set(told), "they follow the file"
+    assert not {"rho_dbm"} & set(told), "they follow the file"
     daemon.status["tasks"][0]["tuning"] = {**OWN, "price_s": 0.5, "reach": "all"}
     assert "price_s=0.5 (file: 0.3)" in run("tune", "echo").stdout
     assert "reach=all (file: majority)" in run("tune", "echo").stdout

@@ -116,7 +116,7 @@ sys.argv = ["zsched", {word!r}, "--help"]
 try:
     zsched.cli.main()
 finally:
-    print([f"zsched.commands.{name}" in sys.modules for name in ("look.status", "act.move", "act.apply")])
+    print(["zsched.commands." + name in sys.modules for name in ("look.status", "act.move", "act.apply")])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.splitlines()[-1] == str([loaded, False, False])

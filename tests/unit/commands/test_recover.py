@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from zsched.commands.base.change import OrderView
 from zsched.commands.base.ask import Door
+from zsched.commands.base.change import OrderView
 from zsched.commands.base.common import CliError, Json
 from zsched.commands.look.history import changes_of
 from zsched.commands.members import recovery

@@ -10,8 +10,8 @@ from support.fleets import task_of, tuning_of
 from zsched.commands.look.check import told
 from zsched.config.schema import LINK_LIMITS, SCHEDULING
 from zsched.core.scheduler.ledger import left_after_s
-from zsched.core.values.fleet import LinkLimits, TaskSpec, Timing
-from zsched.core.values.model import PairReading, Reach, ScoreForm, Weights
+from zsched.core.values.fleet import TaskSpec, Timing
+from zsched.core.values.model import Reach, ScoreForm
 from zsched.core.values.plan import ReadyWhen
 
 TIMING = Timing()
@@ -25,7 +25,7 @@ def words(spec: TaskSpec) -> str:
 
 def test_every_setting_that_differs_from_its_default_is_named_with_its_key() -> None:
     beside = (("plan", 0.2), ("watch", -0.3))
-    most = replace(SPEC, cpu_floor_ratio=0.1, prefer=(("edge1", 0.1),), beside=beside, priority=2)
+    most = replace(SPEC, prefer=(("edge1", 0.1),), beside=beside, priority=2)
     of_all = words(replace(most, tuning=replace(RADIO, deadline_ms=80.0)))
     keys = [*SCHEDULING.items, *(f"link.{key}" for key in LINK_LIMITS.items)]
     assert [key for key in keys if f"({key}" not in of_all] == ["objective"]
@@ -41,7 +41,6 @@ def test_every_setting_that_differs_from_its_default_is_named_with_its_key() -> 
         (replace(SPEC, tuning=replace(RADIO, bonus=0.2)), "0.1 never"),
         (SPEC, "below -80 dBm (link.nu_dbm), or -77 while its own one is reached"),
         (replace(SPEC, gauge_limits=(("battery", 0.2),)), "the battery's charge is below 20 % (limits.battery)"),
-        (replace(SPEC, limits=LinkLimits(pair=PairReading.WEAKER)), "by the weaker (link.pair)"),
         (SPEC, "cpu 0.5 x memory 0.2 x network 0.3 (weights)"),
         (replace(SPEC, tuning=replace(RADIO, score=ScoreForm.PAPER)), "cpu 0.5 + memory 0.2 + network 0.3 (weights)"),
         (replace(SPEC, tuning=replace(RADIO, deadline_ms=80.0)), "done there within 80 ms (deadline_ms)"),
@@ -55,15 +54,6 @@ def test_every_setting_that_differs_from_its_default_is_named_with_its_key() -> 
 def test_a_setting_is_told_by_what_it_does(spec: TaskSpec, said: str) -> None:
     assert said in words(spec), words(spec)
     assert len(told(spec, TIMING)) == 4
-
-
-def test_a_floor_is_told_only_where_what_it_is_of_is_weighed() -> None:
-    floors = replace(SPEC, cpu_floor_ratio=0.1)
-    both, cpu, memory = (
-        words(replace(floors, tuning=replace(RADIO, weights=Weights.of(weights))))
-        for weights in ({"cpu": 0.5, "memory": 0.5}, {"cpu": 1.0}, {"memory": 1.0})
-    )
-    assert ["(cpu_floor_ratio)" in text for text in (both, cpu, memory)] == [True, True, False]
 
 
 def test_a_deadline_is_told_where_the_worker_tells_of_its_jobs() -> None:

@@ -93,9 +93,8 @@ def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -
         ("{}", ["share of its work", "leads by 0.05", "owes 0.3 s more (price_s)"]),
         ("{price_s: 0.7}", ["owes 0.7 s more (price_s)"]),
         ("{score: paper}", ["Eq. 1 and 2"]),
-        ("{reach: all, aggregate: median}", ["6 moves", "a robot cannot reach it", "median (aggregate)"]),
+        ("{reach: all}", ["6 moves", "a robot cannot reach it", "the mean of the robots"]),
         ("{objective: latency, deadline_ms: 80}", ["within 80 ms"]),
-        ("{cpu_floor_ratio: 0.2}", ["under 20 %"]),
     ],
 )
 def test_check_says_in_words_when_a_task_moves(tmp_path: Path, scheduling: str, words: list[str]) -> None:

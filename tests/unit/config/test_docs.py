@@ -1,7 +1,6 @@
 """docs/guide/fleet-file.md says what the schema says, and its examples are real."""
 
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from zsched.core.values.fleet import (
     DEFAULT_BONUS,
     DEFAULT_SCORE,
 )
-from zsched.core.values.model import Tuning
 
 GUIDE = Path(__file__).parents[3] / "docs" / "guide"
 DOC = (GUIDE / "fleet-file.md").read_text()
@@ -26,8 +24,6 @@ def test_reference_is_the_schemas() -> None:
 
 def test_defaults_that_hang_on_each_other_are_the_codes() -> None:
     assert SCHEDULING.items["bonus"].default == f"`{DEFAULT_BONUS:g}`"
-    aggregate = next(field.default for field in fields(Tuning) if field.name == "aggregate")
-    assert SCHEDULING.items["aggregate"].default == f"`{aggregate}`"
     assert SCHEDULING.items["score"].default == f"`{DEFAULT_SCORE}`"
 
 

@@ -20,7 +20,7 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, NodeKind, Objective, PairReading, Reach, ScoreForm
+from zsched.core.values.model import NodeKind, Objective, Reach, ScoreForm
 from zsched.core.values.plan import Direction, HandoverRule, ReadyWhen, StreamClass
 from zsched.core.values.profile import LinkSource
 
@@ -221,9 +221,9 @@ def test_every_setting_of_a_task_arrives() -> None:
         "[python, -m, zsched.tasks.map_merge], standby: warm}\n",
         """\
     scheduling:
-      {bonus: 0.2, aggregate: median, reach: all,
+      {bonus: 0.2, reach: all,
        price_s: 0.7, memory_s: 60}
-    link: {nu_dbm: -75, rho_dbm: -45, pair: weaker}
+    link: {nu_dbm: -75, rho_dbm: -45}
     on_isolation: local
     drain_s: 5
     worker:
@@ -241,8 +241,7 @@ def test_every_setting_of_a_task_arrives() -> None:
     ).replace("class: latest}]", "class: reliable, depth: 99, handover: all}]")
     task = fleet_of(text).task("map_merge")
     assert (task.tuning.bonus, task.price_s, task.memory_s) == (0.2, 0.7, 60)
-    assert (task.tuning.aggregate, task.reach) == (Aggregate.MEDIAN, Reach.ALL)
-    assert task.limits.pair is PairReading.WEAKER
+    assert task.reach is Reach.ALL
     assert (task.limits.nu_dbm, task.limits.rho_dbm) == (-75, -45)
     assert (task.on_isolation, task.drain_s) == (OnIsolation.LOCAL, 5)
     worker = task.worker
@@ -790,21 +789,6 @@ def test_a_candidate_whose_link_nobody_measures_beside_others_is_a_warning(nodes
     found = [one.message for one in result.warnings if "nobody measures a link" in one.message]
     assert len(found) == bool(mute)
     assert all(mute in message for message in found)
-
-
-@pytest.mark.parametrize(
-    ("scheduling", "is_told"),
-    [
-        ("{score: paper, cpu_floor_ratio: 0.2}", True),
-        ("{score: paper, cpu_floor_ratio: 0}", False),
-        ("{cpu_floor_ratio: 0.2}", False),
-    ],
-)
-def test_a_cpu_floor_that_the_paper_s_score_does_not_know_is_a_warning(scheduling: str, *, is_told: bool) -> None:
-    text = "fleet: f\nnodes: {r1: {kind: robot}}\n"
-    result = check(f"{text}tasks: {{t: {{candidates: [r1], weights: {{cpu: 1}}, scheduling: {scheduling}}}}}\n")
-    assert result.fleet is not None, "a running fleet may have such a file"
-    assert any("cpu_floor_ratio changes nothing" in one.message for one in result.warnings) is is_told
 
 
 @pytest.mark.parametrize(

@@ -62,9 +62,7 @@ def test_every_field_is_there(kind: type[Any]) -> None:
 
 
 def test_every_variable_that_a_worker_is_given_is_there() -> None:
-    sources = [
-        (ROOT / "zsched" / name).read_text() for name in ("runtime/recipes.py", "host/workers/supervisor.py")
-    ]
+    sources = [(ROOT / "zsched" / name).read_text() for name in ("runtime/recipes.py", "host/workers/supervisor.py")]
     given = {name for text in sources for name in re.findall(r'"((?:ZSCHED|ZENOH|PYTHON)\w+)": ', text)}
     named = [name.strip("`") for name, _ in rows("| variable |")]
     assert given >= set(_ENVIRONMENT)

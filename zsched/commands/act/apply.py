@@ -15,6 +15,7 @@ from typing import Annotated
 
 import typer
 
+from zsched.commands.base.ask import Door
 from zsched.commands.base.change import (
     QUESTION,
     InForce,
@@ -33,7 +34,6 @@ from zsched.commands.base.change import (
     status_of,
     wait_until_settled,
 )
-from zsched.commands.base.ask import Door
 from zsched.commands.base.common import (
     CliError,
     Json,

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from zsched.commands.base.ask import Door
 from zsched.commands.base.change import (
     DOCUMENT,
     NOTHING,
@@ -33,7 +34,6 @@ from zsched.commands.base.change import (
     told_switch,
     until,
 )
-from zsched.commands.base.ask import Door
 from zsched.commands.base.common import CliError, Json, check_dangers, check_known, print_json, say, told_task
 from zsched.commands.base.options import Changes, ForOption, Orders
 from zsched.commands.base.page import Row, duration_s, span

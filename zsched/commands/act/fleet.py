@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from zsched.commands.act.apply import apply_change, read_text
-from zsched.commands.base.change import QUESTION, InForce, OrderView, ask_all, document_text, in_force, status_of
 from zsched.commands.act.flags import SEAT_ADVICE, without_seat
 from zsched.commands.base.ask import PASSES_ON
+from zsched.commands.base.change import QUESTION, InForce, OrderView, ask_all, document_text, in_force, status_of
 from zsched.commands.base.common import CliError, Json, print_json, say, warn
 from zsched.commands.base.options import Answers, Asks, Edits, OutputOption, PauseAfterOption, new_group
 from zsched.commands.members.membership import create

@@ -10,6 +10,7 @@ from typing import Annotated, Final
 
 import typer
 
+from zsched.commands.base.ask import Door, ask_door
 from zsched.commands.base.change import (
     CODES,
     NOTHING,
@@ -22,7 +23,6 @@ from zsched.commands.base.change import (
     tell_results,
     until,
 )
-from zsched.commands.base.ask import Door, ask_door
 from zsched.commands.base.common import CliError, Json, check_known, print_json, say
 from zsched.commands.base.options import ForOption, Orders
 from zsched.commands.base.page import span

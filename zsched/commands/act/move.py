@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from zsched.commands.base.ask import Door, ask_door
 from zsched.commands.base.change import (
     Plan,
     agreed,
@@ -21,7 +22,6 @@ from zsched.commands.base.change import (
     told_switch,
     until,
 )
-from zsched.commands.base.ask import Door, ask_door
 from zsched.commands.base.common import CliError, Json, check_known, print_json, say, told_task
 from zsched.commands.base.options import Orders, TaskArgument
 from zsched.commands.base.page import span

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.base.change import CODES, Plan, consent, status_of
 from zsched.commands.base.ask import ask_door
+from zsched.commands.base.change import CODES, Plan, consent, status_of
 from zsched.commands.base.common import CliError, Json, print_json, say, told_task
 from zsched.commands.base.options import Consents, TaskArgument
 from zsched.commands.look.logs import worker_node

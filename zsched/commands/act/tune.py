@@ -12,15 +12,15 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from zsched.commands.base.change import CODES, OrderView, Plan, consent, status_of, tell_results
 from zsched.commands.base.ask import ask_door
+from zsched.commands.base.change import CODES, OrderView, Plan, consent, status_of, tell_results
 from zsched.commands.base.common import CliError, Json, check_known, nearest, print_json, say, warn
 from zsched.commands.base.options import Orders
 from zsched.commands.base.page import NAMES, shares
 from zsched.core.values.deadline import TELLS_NOTHING, DeadlineFault, deadline_fault
 from zsched.core.values.exits import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from zsched.core.values.fleet import TUNED_LINKS, TUNED_RULES
-from zsched.core.values.model import Aggregate, PairReading, Reach, ScoreForm, Tuning, Weights
+from zsched.core.values.model import Reach, ScoreForm, Tuning, Weights
 from zsched.core.values.struct import replace
 from zsched.core.values.words import meant, shown
 
@@ -29,15 +29,13 @@ TUNING_SCHEMA: Final = "zsched.tuning/1"
 
 _NUMBERS: Final = ("bonus", "deadline_ms")
 _WORDS: Final[Mapping[str, type[StrEnum]]] = {
-    "aggregate": Aggregate,
     "score": ScoreForm,
     "reach": Reach,
-    "pair": PairReading,
 }
 WEIGHTS: Final = NAMES
 OF_THE_FILE: Final = (*TUNED_RULES, *TUNED_LINKS)
 """Settings that follow the fleet file, unless an operator has set another value."""
-KEYS: Final = (*WEIGHTS, *_NUMBERS, "aggregate", "score", *OF_THE_FILE)
+KEYS: Final = (*WEIGHTS, *_NUMBERS, "score", *OF_THE_FILE)
 
 
 def tuned(before: Json, file: Json, pairs: Sequence[str]) -> dict[str, Any]:
@@ -140,7 +138,6 @@ def _checked(after: Json, file: Json) -> Json:
         tuning = Tuning(
             weights=Weights.of(after["weights"]),
             bonus=after["bonus"],
-            aggregate=Aggregate(after["aggregate"]),
             score=ScoreForm(after["score"]),
             deadline_ms=deadline_ms,
             **_own(after),

@@ -18,8 +18,8 @@ from zsched.commands.base.common import Verb, Verbs
 from zsched.core.values.exits import EXIT_OK
 
 if TYPE_CHECKING:
-    from zsched.commands.base.change import OrderView
     from zsched.commands.base.ask import Door
+    from zsched.commands.base.change import OrderView
     from zsched.commands.base.places import Machine as Where
     from zsched.commands.base.places import Places
 

@@ -437,7 +437,7 @@ def _candidates(page: Page, task: Json, decision: Json) -> None:
     hidden = len(voters) - len(widths)
     more = f"+{hidden}" if hidden else ""
     columns = [first, -6, *(-width for width in widths), -5, -5, -5, page.width]
-    titles = ["candidate", task["tuning"]["aggregate"], *voters[: len(widths)], "cpu", "mem", "net", more]
+    titles = ["candidate", "mean", *voters[: len(widths)], "cpu", "mem", "net", more]
     page.row(*((title, width, "dim") for title, width in zip(titles, columns, strict=True)), indent=page.indent)
     for name in names[:MAX_CANDIDATES]:
         veto = decision["vetoed"].get(name)

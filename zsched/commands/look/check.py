@@ -105,9 +105,7 @@ def _worth(spec: TaskSpec) -> Iterator[str]:
     in_time = f" within {tuning.deadline_ms:g} ms (deadline_ms)" if is_timed else ""
     terms = (" x " if is_service else " + ").join(f"{name} {share:g}" for name, share in tuning.weights.shares if share)
     yield f"a machine is worth {worth}{in_time} (score: {tuning.score})"
-    yield f"{terms} (weights), the robots' {tuning.aggregate} (aggregate)"
-    if is_service and tuning.weights.cpu > 0.0 and spec.cpu_floor_ratio > 0.0:
-        yield f"less where under {100 * spec.cpu_floor_ratio:g} % of the CPU stay free (cpu_floor_ratio)"
+    yield f"{terms} (weights), the mean of the robots"
     yield from (f"{more:g} more on {node} (prefer)" for node, more in spec.prefer)
     for task, more in spec.beside:
         yield f"{more:g} more beside {task} (together)" if more > 0.0 else f"{-more:g} less beside {task} (spread)"
@@ -125,7 +123,7 @@ def _limits(spec: TaskSpec) -> Iterator[str]:
     low = spec.limits.nu_dbm
     yield f"the signal is below {low:g} dBm (link.nu_dbm), or {low + REACH_MARGIN_DB:g} while its own one is reached"
     if spec.tuning.weights.network > 0.0:
-        yield f"from {spec.limits.rho_dbm:g} dBm on it is worth 1 (link.rho_dbm), by the {spec.limits.pair} (link.pair)"
+        yield f"from {spec.limits.rho_dbm:g} dBm on it is worth 1 (link.rho_dbm)"
 
 
 def _left(spec: TaskSpec, timing: Timing, lead: float) -> str:

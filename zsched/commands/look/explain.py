@@ -381,7 +381,6 @@ def _tuning(page: Page, body: Json) -> None:
         "TUNING",
         (weights, ""),
         ("sum" if tuning["score"] == "paper" else "product", ""),
-        (str(tuning["aggregate"]), ""),
         (f"bonus {tuning['bonus']:g}", ""),
         (f"a move costs {body['price_s']:g} s", ""),
         (f"owner known for {span(body['known_for_s'])}", ""),
@@ -463,14 +462,14 @@ def _candidates(page: Page, body: Json) -> None:
             page.row(*zip(cells, columns, styles, strict=True))
         if not one["robots"]:
             page.row((one["node"], first, "bold" if one["is_owner"] else ""))
-        _sum(page, body, one, first)
+        _sum(page, one, first)
 
 
-def _sum(page: Page, body: Json, one: Json, indent: int) -> None:
+def _sum(page: Page, one: Json, indent: int) -> None:
     need = "" if one["need_cpu_cores"] is None else f"{one['need_cpu_cores']:.2f} cores {memory(one['need_memory_mb'])}"
     text, style = "", ""
     if one["joint"] is not None:
-        text = f"{body['tuning']['aggregate']} {one['joint']:.4f}"
+        text = f"mean {one['joint']:.4f}"
         text += f" - not kept {one['unkept']:.4f}" if one.get("unkept") else ""
         text += f" + bonus {one['bonus']:g}" if one["bonus"] else ""
     if one["total"] is not None:

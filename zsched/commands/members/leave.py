@@ -17,6 +17,17 @@ from typing import Annotated, Final
 
 import typer
 
+from zsched.commands.act.flags import (
+    LEAVE,
+    NO_OTHER,
+    TITLES,
+    DrainOrder,
+    check_in_force,
+    drain_nodes,
+    has_flag,
+    told_over,
+)
+from zsched.commands.base.ask import Door, ask_door, find_door
 from zsched.commands.base.change import (
     DOCUMENT,
     HERE,
@@ -37,17 +48,6 @@ from zsched.commands.base.change import (
     ordered,
     until,
 )
-from zsched.commands.act.flags import (
-    LEAVE,
-    NO_OTHER,
-    TITLES,
-    DrainOrder,
-    check_in_force,
-    drain_nodes,
-    has_flag,
-    told_over,
-)
-from zsched.commands.base.ask import Door, ask_door, find_door
 from zsched.commands.base.common import CliError, Json, again, check_dangers, check_taken, say, warn
 from zsched.commands.base.options import (
     AcceptOption,
@@ -59,8 +59,8 @@ from zsched.commands.base.options import (
     YesOption,
 )
 from zsched.commands.base.page import Row, duration_s, lined, span
-from zsched.commands.base.renewing import HOLDS_AUTHORITY, authority_here, bring_advice, left_behind
 from zsched.commands.base.places import Places
+from zsched.commands.base.renewing import HOLDS_AUTHORITY, authority_here, bring_advice, left_behind
 from zsched.commands.members.belongings import (
     Written,
     belongings,

@@ -20,8 +20,8 @@ from typing import Annotated, Final
 import typer
 
 from zsched.commands.act.apply import apply_change
-from zsched.commands.base.change import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
 from zsched.commands.base.ask import CONTROL_PORT, Door, ask_door
+from zsched.commands.base.change import DOCUMENT, HERE, InForce, document_text, fleet_of, in_force, status_of
 from zsched.commands.base.common import CliError, Json, again, check_name, nearest, print_json, say, uninterrupted, warn
 from zsched.commands.base.options import AcceptOption, Edits, Files, Here, JsonOption, OutputOption, PlanOption
 from zsched.commands.base.places import Places

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 from zsched.commands.act.apply import DANGERS, OPEN_NETWORK
 from zsched.commands.base.common import CliError, check_dangers, check_name, warn
-from zsched.commands.base.renewing import holds_authority, renew_advice
 from zsched.commands.base.places import Places
+from zsched.commands.base.renewing import holds_authority, renew_advice
 from zsched.commands.members.belongings import Written, request_here
 from zsched.commands.members.pki import held_here, hosts_of, new_secret, now_here, passphrase_of, read_request
 from zsched.commands.members.unfinished import mark_of

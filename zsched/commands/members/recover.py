@@ -12,8 +12,8 @@ from typing import Annotated
 
 import typer
 
-from zsched.commands.base.change import OrderView, Plan, consent, user_name
 from zsched.commands.base.ask import Door
+from zsched.commands.base.change import OrderView, Plan, consent, user_name
 from zsched.commands.base.common import CliError, check_dangers, say, warn
 from zsched.commands.base.options import AcceptOption, Here, PlanOption, YesOption
 from zsched.commands.members import recovery as runtime

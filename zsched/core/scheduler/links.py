@@ -4,7 +4,7 @@ Knows: links that were measured directly, the two ways of a pair that meet at an
 has measured yet. Does not know: weights, who may have the task, how signals are smoothed.
 
 Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead.
-What it is *worth* depends on the task's reading of a pair.
+What it is *worth* is told by the candidate's own way.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping
 from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.utility import network_utility
 from zsched.core.values.fleet import LinkLimits
-from zsched.core.values.model import NodeId, PairReading
+from zsched.core.values.model import NodeId
 from zsched.core.values.profile import LinkSource, Profile
 from zsched.core.values.struct import Struct
 
@@ -50,7 +50,7 @@ def pair_link(
     ``own_margin_db`` above it.
 
     A link measured between the two counts as it is, from either end. Else both reach each other through one access
-    point, and ``limits.pair`` says how the two ways become one.
+    point, and the candidate's own way counts, as the paper prints Eq. 3: the robot's is part of every path.
     """
     if voter == candidate:
         return PairLink(is_reached=True, utility=1.0)
@@ -64,8 +64,7 @@ def pair_link(
         return None
     is_reached = own_dbm >= nu_dbm and its_dbm >= nu_dbm
     is_clear = own_dbm >= nu_dbm + own_margin_db and its_dbm >= nu_dbm + margin_db
-    signal_dbm = its_dbm if limits.pair is PairReading.CANDIDATE else min(own_dbm, its_dbm)
-    utility = network_utility(signal_dbm, nu_dbm, limits.rho_dbm)
+    utility = network_utility(its_dbm, nu_dbm, limits.rho_dbm)
     return PairLink(is_reached, utility, is_reached and not is_clear, is_direct)
 
 

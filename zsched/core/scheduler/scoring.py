@@ -29,7 +29,6 @@ from zsched.core.scheduler.utility import (
     memory_utility,
     on_time,
     service_utility,
-    spare_factor,
     timely_worth,
 )
 from zsched.core.values.fleet import TaskSpec
@@ -242,14 +241,14 @@ class _View:
         # it gets at least this if it needs it, however full the machine is
         fair = 0.0 if is_outranked else self._gateway.shares.at(spec.name, profile, need, coming)
         free, is_owner = left + need, profile.node == self._allocation.owner
-        share = spare_factor(left, profile.cpu_cores, spec.cpu_floor_ratio)
+        share = 1.0
         if self._job is not None:
             speed = speed_of(profile)
             if deadline_ms is not None:
                 seen_s = demands.seen_s(spec.name, profile) if is_owner else 0.0
                 # a job gets that while it runs; between its jobs a task uses nothing, so that may be far more
                 job_s = max(self._job.age_s(speed, max(free, fair)), seen_s) + network_s
-                share *= timely_worth(on_time(job_s, deadline_ms / 1e3))
+                share = timely_worth(on_time(job_s, deadline_ms / 1e3))
         load = profile.worker(spec.name) if is_owner else None
         if load is not None and is_short(load):  # what such an owner gives is measured
             worth = service_utility(free, need, profile.cpu_cores, least=min(fair, own), share=share)

@@ -7,11 +7,10 @@ Knows: Eq. 5-6, vetoes. Does not know: how a score is made (`zsched.core.schedul
 from __future__ import annotations
 
 import math
-import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Aggregate, Allocation, NodeId, Reach, Utility, UtilityVector
+from zsched.core.values.model import Allocation, NodeId, Reach, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.veto import Filter, Veto
@@ -87,7 +86,6 @@ def compare(
     reasons: dict[NodeId, Veto] = {}
     for vector in fresh:
         reasons |= vector.vetoes
-    mean = mean_of(allocation.tuning.aggregate)
     vetoed: dict[NodeId, Veto] = {}
     kept: list[NodeId] = []
     for candidate in spec.candidates:
@@ -104,7 +102,7 @@ def compare(
         else:
             kept.append(candidate)
     return Standing(
-        aggregates=_aggregates(kept, rows, mean),
+        aggregates=_aggregates(kept, rows),
         vetoed=vetoed,
         vectors=fresh,
         voters_heard=len(fresh),
@@ -130,9 +128,9 @@ def _with_margin(vector: UtilityVector) -> UtilityVector:
     return replace(vector, utilities=tuple(near))
 
 
-def mean_of(aggregate: Aggregate) -> Callable[[list[float]], float]:
-    """How robots' utilities become one."""
-    return (lambda one: math.fsum(one) / len(one)) if aggregate is Aggregate.MEAN else statistics.median
+def mean(utilities: Sequence[float]) -> float:
+    """How robots' utilities become one (Eq. 5-6)."""
+    return math.fsum(utilities) / len(utilities)
 
 
 def _comparable(candidates: Iterable[NodeId], rows: Sequence[_Row]) -> Sequence[_Row]:
@@ -146,9 +144,7 @@ def _comparable(candidates: Iterable[NodeId], rows: Sequence[_Row]) -> Sequence[
     return whole if len(whole) >= majority(len(rows)) else rows
 
 
-def _aggregates(
-    candidates: list[NodeId], rows: Sequence[_Row], mean: Callable[[list[float]], float]
-) -> dict[NodeId, float]:
+def _aggregates(candidates: list[NodeId], rows: Sequence[_Row]) -> dict[NodeId, float]:
     told = _comparable(candidates, rows)
     return {name: mean([row[name].value for row in told if name in row]) for name in candidates}
 

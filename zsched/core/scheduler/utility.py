@@ -138,25 +138,6 @@ def timely_worth(on_time_ratio: float) -> float:
     return LATE_WORTH + (1.0 - LATE_WORTH) * on_time_ratio
 
 
-NEARLY_FULL = 0.15
-"""This part of the CPU's term goes where nothing is left beside the task: enough to leave for, in some seconds."""
-
-
-def spare_factor(left: float, capacity: float, floor_ratio: float) -> float:
-    """What of the CPU's term counts where a task leaves so much: less below the floor, down to 1 - `NEARLY_FULL`.
-
-    Args:
-        left: free beside the task; below 0 counts as 0.
-        capacity: of the machine, in the same unit, > 0.
-        floor_ratio: of the machine, in [0, 1); 0: it counts whole.
-
-    >>> [round(spare_factor(left, 4.0, 0.1), 3) for left in (-1.0, 0.0, 0.2, 0.4)]
-    [0.85, 0.85, 0.925, 1.0]
-    """
-    floor = floor_ratio * capacity
-    return 1.0 - NEARLY_FULL * clamp(1.0 - left / floor) if left < floor and floor > 0.0 else 1.0
-
-
 def network_utility(signal_dbm: float, nu_dbm: float, rho_dbm: float) -> float:
     """Eq. 3, ``kappa = (lambda - nu) / (rho - nu)``: the link's share of what is achievable.
 

@@ -20,14 +20,12 @@ from zsched.core.values.endpoint import Endpoint
 from zsched.core.values.gauges import check_limits
 from zsched.core.values.limits import Range, check_ranges, key
 from zsched.core.values.model import (
-    MAX_FLOOR,
     MAX_PRICE_S,
     RSSI_MAX_DBM,
     RSSI_MIN_DBM,
     Allocation,
     NodeId,
     NodeKind,
-    PairReading,
     Reach,
     ScoreForm,
     TaskId,
@@ -202,7 +200,7 @@ class StreamRule(Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkLimits:
-    """Eq. 3: nu (least usable) and rho (best achievable) in dBm, and how links are read."""
+    """Eq. 3: nu (least usable) and rho (best achievable) in dBm."""
 
     nu_dbm: float = key(
         -80.0,
@@ -211,16 +209,12 @@ class LinkLimits:
         DBM,
     )
     rho_dbm: float = key(-40.0, "Best achievable signal (Eq. 3); above `nu_dbm`.", DBM)
-    pair: PairReading = key(
-        PairReading.CANDIDATE,
-        "Through an access point a link counts by the candidate's way, or by the weaker one.",
-    )
 
 
-TASK_RULES = ("reach", "cpu_floor_ratio", "price_s", "memory_s", "priority")
+TASK_RULES = ("reach", "price_s", "memory_s", "priority")
 """Keys of `scheduling` that are fields of `TaskSpec`, under the same name."""
-TUNED_RULES = ("reach", "cpu_floor_ratio", "price_s")
-TUNED_LINKS = ("nu_dbm", "rho_dbm", "pair")
+TUNED_RULES = ("reach", "price_s")
+TUNED_LINKS = ("nu_dbm", "rho_dbm")
 """Settings of a task's file that a `Tuning` may set anew: fields of `TaskSpec` and of `LinkLimits`."""
 
 
@@ -237,12 +231,6 @@ class TaskSpec:
     gauge_limits: Readings = ()
     """Sorted; how far a candidate's gauges may go (`zsched.core.values.gauges`)."""
     reach: Reach = key(Reach.MAJORITY, "Who must reach a candidate, of the robots that answer.")
-    cpu_floor_ratio: float = key(
-        0.0,
-        "Where the task leaves less CPU free, it counts up to 15 % less: room for programs that are no tasks, such as "
-        "a robot's SLAM.",
-        Range(0, MAX_FLOOR),
-    )
     price_s: float = key(
         0.3,
         "What a move costs, in seconds of the task's work: the task moves once its machine owes so much more.",
@@ -531,7 +519,7 @@ _LATER = frozenset(
         ("Weights", "gauges"),
         ("Demand", "gpu"),
     }
-    | {("TaskSpec", name) for name in ("gauge_limits", "rollout", "cpu_floor_ratio", "prefer", "beside", "priority")}
+    | {("TaskSpec", name) for name in ("gauge_limits", "rollout", "prefer", "beside", "priority")}
     | {("Fleet", "cells"), ("WorkerSpec", "user")}
     | {("Tuning", name) for name in (*TUNED_RULES, *TUNED_LINKS)}
 )

@@ -5,8 +5,8 @@ of its machine (`zsched.core.values.profile`) and of itself (`zsched.core.values
 
 Every class is a frozen dataclass whose fields are plain (str, int, float, bool, enum, tuple, another value), so that
 `zsched.core.values.codec` can encode any of them and no object is ever shared with an adapter. ``None`` means "not
-measured" or "not there", never -1. A value out of range raises `ValueError` naming the field: from the wire that is a counted,
-dropped frame; from our own code it is a bug.
+measured" or "not there", never -1. A value out of range raises `ValueError` naming the field: from the wire that is a
+counted, dropped frame; from our own code it is a bug.
 """
 
 from __future__ import annotations
@@ -83,13 +83,6 @@ class NodeKind(StrEnum):
     EDGE = "edge"
 
 
-class Aggregate(StrEnum):
-    """How a column of utilities (one per fresh voter) becomes one number (Eq. 5-6)."""
-
-    MEAN = "mean"
-    MEDIAN = "median"
-
-
 class ScoreForm(StrEnum):
     """How a candidate's CPU and memory become a utility (`zsched.core.scheduler.utility`)."""
 
@@ -109,15 +102,6 @@ class Reach(StrEnum):
 
     MAJORITY = "majority"
     ALL = "all"
-
-
-class PairReading(StrEnum):
-    """How to value a link whose two ends reach each other through one access point."""
-
-    CANDIDATE = "candidate"
-    """The candidate's own way, as the paper prints Eq. 3: the robot's is part of every path, and decides nothing."""
-    WEAKER = "weaker"
-    """The weaker of the two ways: the bottleneck."""
 
 
 # --- what an operator sets -------------------------------------------------------------------------------------------
@@ -161,7 +145,7 @@ class Weights(Struct, frozen=True, kw_only=True):
 
 
 MIN_DEADLINE_MS, MAX_DEADLINE_MS = 1.0, 3.6e6
-MAX_PRICE_S, MAX_FLOOR, MAX_AGGREGATE = 1000.0, 0.9, 2.0
+MAX_PRICE_S, MAX_AGGREGATE = 1000.0, 2.0
 
 
 class Tuning(Struct, frozen=True, kw_only=True):
@@ -172,7 +156,6 @@ class Tuning(Struct, frozen=True, kw_only=True):
 
     weights: Weights
     bonus: float = 0.10
-    aggregate: Aggregate = Aggregate.MEAN
     score: ScoreForm = ScoreForm.PAPER
     deadline_ms: float | None = None
     """`Objective.LATENCY`: a job that takes longer from input to output, network included, comes too late. ``None``:
@@ -182,8 +165,6 @@ class Tuning(Struct, frozen=True, kw_only=True):
     reach: Reach | None = None
     nu_dbm: float | None = None
     rho_dbm: float | None = None
-    pair: PairReading | None = None
-    cpu_floor_ratio: float | None = None
 
     @property
     def objective(self) -> Objective:
@@ -194,7 +175,6 @@ class Tuning(Struct, frozen=True, kw_only=True):
         check_range("deadline_ms", self.deadline_ms, MIN_DEADLINE_MS, MAX_DEADLINE_MS)
         check_range("bonus", self.bonus, 0.0, 1.0)
         check_range("price_s", self.price_s, 0.0, MAX_PRICE_S)
-        check_range("cpu_floor_ratio", self.cpu_floor_ratio, 0.0, MAX_FLOOR)
         check_range("nu_dbm", self.nu_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
         check_range("rho_dbm", self.rho_dbm, RSSI_MIN_DBM, RSSI_MAX_DBM)
 

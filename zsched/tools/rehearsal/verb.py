@@ -17,9 +17,9 @@ from typing import Annotated, Final, TypeVar
 
 import typer
 
-from zsched.commands.base.change import IN_FORCE_S, OrderView, Plan, asker, consent, document_text, in_force
 from zsched.commands.act.flags import drain_quietly, is_given_for, lift_quietly
 from zsched.commands.base.ask import Door, ask_door
+from zsched.commands.base.change import IN_FORCE_S, OrderView, Plan, asker, consent, document_text, in_force
 from zsched.commands.base.common import (
     CliError,
     Json,

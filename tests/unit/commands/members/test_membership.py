@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from zsched.commands.base.places import Places
 from zsched.commands.members import belongings as membership
 from zsched.commands.members import unfinished
-from zsched.commands.base.places import Places
-from zsched.host.document_store import copied_file
 from zsched.commands.members.belongings import (
     BEFORE,
     found,
@@ -34,7 +33,7 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.errors import AdapterError, ConfigError
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.host import state_file
-from zsched.host.document_store import DocumentStore
+from zsched.host.document_store import DocumentStore, copied_file
 from zsched.host.state_file import StateFile
 from zsched.link.invitation import Invitation, Papers
 

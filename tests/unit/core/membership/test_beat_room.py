@@ -12,12 +12,11 @@ from support.fleets import fleet_of, node_of, task_of
 from support.states import state_of
 from zsched.config.load import check_bytes
 from zsched.core.membership.beat_room import FRAME_BYTES, BeatRoom, beat_bytes, most_bytes
-from zsched.core.values.beat import MAX_BEAT_BYTES
 from zsched.core.node.node import Node
 from zsched.core.values import codec as wire
 from zsched.core.values import events as ev
 from zsched.core.values import instructions as do
-from zsched.core.values.beat import Beat, Grant
+from zsched.core.values.beat import MAX_BEAT_BYTES, Beat, Grant
 from zsched.core.values.fleet import Fleet, WorkerSpec
 from zsched.core.values.model import MAX_COUNTER
 from zsched_lab.sim.simulator import Simulator

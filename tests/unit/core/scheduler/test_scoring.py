@@ -15,12 +15,11 @@ from zsched.core.gateway.gateway import Gateway
 from zsched.core.scheduler.eligibility import NO_DOUBTS, Doubts
 from zsched.core.scheduler.scoring import score
 from zsched.core.scheduler.standing import LOST_S, compare, pick, reaches_owner
-from zsched.core.scheduler.utility import NEARLY_FULL, service_utility
-from zsched.core.values.fleet import DEFAULT_BONUS, Demand, LinkLimits, Standby, TaskSpec, Timing, WorkerSpec
+from zsched.core.scheduler.utility import service_utility
+from zsched.core.values.fleet import Demand, Standby, TaskSpec, Timing, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import (
     Allocation,
-    PairReading,
     PeerState,
     Reach,
     ScoreForm,
@@ -123,28 +122,6 @@ def test_a_full_machine_is_worth_the_fair_share_of_it_to_all_but_an_owner_that_l
     hungry = tuple(replace(load, wanted_cores=2.0) for load in full[0].workers)
     short = values(scored(ROBOT, replace(full[0], workers=hungry), full[1], spec=spec, agreed=agreed))
     assert short["edge1"] == untold["edge1"] == pytest.approx(service_utility(0.2, 2.0, 4.0))
-
-
-def test_a_machine_that_a_task_fills_counts_less_where_others_are_to_have_their_cpu() -> None:
-    """It gets all that it needs on both; on the second one programs that are no tasks would have nothing left."""
-    agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=CPU, score=ScoreForm.SERVICE))
-
-    def lead(floor: float, used: float, owner: str = "edge1") -> float:
-        spec = replace(SPEC, candidates=("edge1", "edge2"), demand=Demand(cpu_cores=0.4), cpu_floor_ratio=floor)
-        own = {name: 0.4 if name == owner else 0.0 for name in spec.candidates}
-        free = profile("edge1", cpu=0.4 + own["edge1"], own=(own["edge1"], 0.0))
-        full = profile("edge2", cpu=used + own["edge2"], own=(own["edge2"], 0.0))
-        told = values(scored(ROBOT, free, full, spec=spec, agreed=replace(agreed, owner=owner)))
-        return told["edge1"] - told["edge2"]
-
-    assert lead(0.0, used=3.6) < DEFAULT_BONUS
-    assert (
-        lead(0.1, used=3.6)
-        == lead(0.1, used=3.6, owner="edge2")
-        == pytest.approx(NEARLY_FULL + lead(0.0, 3.6), abs=0.02)
-    )
-    assert lead(0.1, used=3.6) > lead(0.1, used=3.3) > lead(0.0, used=3.3), "7 % would be left"
-    assert lead(0.1, used=3.0) == lead(0.0, used=3.0)
 
 
 def test_an_owner_has_the_memory_that_it_holds_though_not_all_of_it_shows_as_its_own() -> None:
@@ -574,62 +551,40 @@ def test_an_owner_whose_worker_does_not_run_uses_nothing_for_it() -> None:
 # --- links ---------------------------------------------------------------------------------------------------------
 
 
-def pair_of(mine: tuple[Link, ...], theirs: tuple[Link, ...], limits: LinkLimits) -> Utility:
+def pair_of(mine: tuple[Link, ...], theirs: tuple[Link, ...]) -> Utility:
     """robot1's utility of edge1."""
-    spec = replace(SPEC, limits=limits)
-    return scored(profile("robot1", links=mine, state=None), profile("edge1", links=theirs), spec=spec).utilities[0]
+    return scored(profile("robot1", links=mine, state=None), profile("edge1", links=theirs), spec=SPEC).utilities[0]
 
 
 @pytest.mark.parametrize(
-    ("mine", "theirs", "weaker", "candidate"),
+    ("mine", "theirs", "worth"),
     [
-        (radio(-50.0), WIRED, 0.75, 1.0),
-        (radio(-50.0), radio(-60.0), 0.5, 0.5),
-        (radio(-60.0), radio(-50.0), 0.5, 0.75),
-        (WIRED, WIRED, 1.0, 1.0),
-        (WIRED, radio(-60.0), 0.5, 0.5),
-        (radio(-50.0), (), None, None),
-        ((), WIRED, None, None),
-        (radio(None), WIRED, None, None),
-        ((*radio(-70.0), *radio(-50.0, "edge1")), radio(-79.0), 0.75, 0.75),
-        (radio(-70.0), (*radio(-79.0), *radio(-50.0, "robot1")), 0.75, 0.75),
-        ((*radio(-70.0), Link(source=LinkSource.WIRED, peer="edge1")), radio(-79.0), 1.0, 1.0),
-        ((*radio(-50.0), *radio(None, "edge1")), WIRED, 0.75, 1.0),
-        ((*radio(-50.0), *radio(-70.0, "edge2")), WIRED, 0.75, 1.0),
+        (radio(-50.0), WIRED, 1.0),
+        (radio(-50.0), radio(-60.0), 0.5),
+        (radio(-60.0), radio(-50.0), 0.75),
+        (WIRED, WIRED, 1.0),
+        (WIRED, radio(-60.0), 0.5),
+        (radio(-50.0), (), None),
+        ((), WIRED, None),
+        (radio(None), WIRED, None),
+        ((*radio(-70.0), *radio(-50.0, "edge1")), radio(-79.0), 0.75),
+        (radio(-70.0), (*radio(-79.0), *radio(-50.0, "robot1")), 0.75),
+        ((*radio(-70.0), Link(source=LinkSource.WIRED, peer="edge1")), radio(-79.0), 1.0),
+        ((*radio(-50.0), *radio(None, "edge1")), WIRED, 1.0),
+        ((*radio(-50.0), *radio(-70.0, "edge2")), WIRED, 1.0),
     ],
 )
-def test_the_link_of_a_pair(
-    mine: tuple[Link, ...], theirs: tuple[Link, ...], weaker: float | None, candidate: float | None
-) -> None:
-    """Directly measured as it is, from either end; else through the access point, by the task's reading of a pair."""
-    found = {pair: pair_of(mine, theirs, LinkLimits(pair=pair)).network for pair in PairReading}
-
-    assert found == {PairReading.WEAKER: weaker, PairReading.CANDIDATE: candidate}
+def test_the_link_of_a_pair(mine: tuple[Link, ...], theirs: tuple[Link, ...], worth: float | None) -> None:
+    """Directly measured as it is, from either end; else through the access point, by the candidate's own way."""
+    assert pair_of(mine, theirs).network == worth
 
 
-@pytest.mark.parametrize("pair", list(PairReading))
 @pytest.mark.parametrize("dead_end", ["mine", "theirs"])
-def test_a_path_with_a_dead_end_is_dead_by_every_reading(pair: PairReading, dead_end: str) -> None:
+def test_a_path_with_a_dead_end_is_dead(dead_end: str) -> None:
     """Below nu on either way the candidate is not reached, however good the other way is."""
     ways = {"mine": radio(-45.0), "theirs": radio(-45.0), dead_end: radio(-81.0)}
 
-    assert not pair_of(ways["mine"], ways["theirs"], LinkLimits(pair=pair)).reachable
-
-
-def test_of_three_robots_the_best_and_the_second_best_tie_by_the_weaker_way_only() -> None:
-    """Why `weaker` is not the default: it cannot tell the two best of three robots apart."""
-    signals = {"robot1": -45.0, "robot2": -65.0, "robot3": -75.0}
-    leads = {}
-    for pair in PairReading:
-        spec = replace(SPEC, candidates=tuple(signals), limits=LinkLimits(pair=pair))
-        profiles = [profile(name, links=radio(dbm)) for name, dbm in signals.items()]
-        agreed = allocation(Weights(cpu=0.0, memory=0.0, network=1.0), owner="robot2")
-        vectors = {name: scored(*profiles, spec=spec, agreed=agreed, voter=name) for name in signals}
-        joint = compare(spec, agreed, vectors).aggregates
-        leads[pair] = joint["robot1"] - joint["robot2"]
-
-    assert leads[PairReading.WEAKER] == pytest.approx(0.0)
-    assert leads[PairReading.CANDIDATE] == pytest.approx(2 / 3 * 0.5)
+    assert not pair_of(ways["mine"], ways["theirs"]).reachable
 
 
 def test_a_robot_that_is_a_candidate_reaches_itself() -> None:

@@ -107,7 +107,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "deadline_ms": (1.0, 3.6e6),
     "for_s": (1.0, model.MAX_FOR_S),
     "price_s": (0.0, model.MAX_PRICE_S),
-    "cpu_floor_ratio": (0.0, model.MAX_FLOOR),
     "nu_dbm": (-120.0, 0.0),
     "rho_dbm": (-120.0, 0.0),
 }

@@ -21,7 +21,7 @@ from zsched.core.values.fleet import (
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import Aggregate, NodeKind, PairReading, Reach, Weights
+from zsched.core.values.model import NodeKind, Reach, Weights
 from zsched.core.values.plan import Direction
 from zsched.core.values.profile import LinkSource
 
@@ -49,7 +49,6 @@ FLEET = Fleet(
 
 def test_defaults_are_the_design_s_first_ones() -> None:
     assert (TUNING.bonus, TASK.price_s, TASK.memory_s) == (0.10, 0.3, 1000.0)
-    assert TUNING.aggregate is Aggregate.MEAN
     assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
     timing = Timing()
     assert (timing.sample_s, timing.smoothing_s) == (0.2, 0.3)
@@ -133,11 +132,9 @@ def test_electorate_hash_depends_on_fleet_and_electors_only() -> None:
 
 OWN: dict[str, Any] = {
     "price_s": 0.7,
-    "cpu_floor_ratio": 0.2,
     "reach": Reach.ALL,
     "nu_dbm": -70.0,
     "rho_dbm": -30.0,
-    "pair": PairReading.WEAKER,
 }
 
 
@@ -155,7 +152,7 @@ def test_a_tuning_sets_what_it_names_and_leaves_the_rest_to_the_file() -> None:
 
 
 def test_ranges_are_those_of_the_file_and_a_signal_that_does_not_fit_the_file_is_left_out() -> None:
-    wrong: dict[str, Any] = {"price_s": -1.0, "cpu_floor_ratio": 0.95, "nu_dbm": 1.0}
+    wrong: dict[str, Any] = {"price_s": -1.0, "nu_dbm": 1.0}
     for key, value in wrong.items():
         with pytest.raises(ValueError, match=key):
             replace(TUNING, **{key: value})

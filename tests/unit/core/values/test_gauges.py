@@ -109,7 +109,6 @@ def test_without_gauges_no_frame_and_no_hash_differs_from_an_older_programs() ->
     for other in (
         task_of(gauge_limits=(("battery", 0.2),)),
         task_of(demand=Demand(gpu=0.5)),
-        task_of(cpu_floor_ratio=0.1),
         task_of(tuning=Tuning(weights=Weights.of({"cpu": 0.5, "memory": 0.4, "gpu": 0.1}))),
     ):
         assert fleet_hash(fleet_of(other)) != fleet_hash(plain)

@@ -13,7 +13,7 @@ from support.fleets import fleet_of, task_of, tuning_of
 from zsched.core.values.change import Retune
 from zsched.core.values.fleet import Fleet, LinkLimits
 from zsched.core.values.in_force import InForce
-from zsched.core.values.model import Aggregate, Allocation, Reach, Tuning, Weights
+from zsched.core.values.model import Allocation, Reach, ScoreForm, Tuning, Weights
 from zsched.core.vote.retuning import AGAIN_S, RANK_S, Retuning
 
 FILE = tuning_of(bonus=0.05)
@@ -38,7 +38,7 @@ def wished(agreed: Tuning, before: dict[str, Any], after: dict[str, Any], *, me:
 
 
 def test_a_changed_setting_is_wanted_and_the_others_stay_as_they_were_tuned() -> None:
-    agreed = replace(FILE, aggregate=Aggregate.MEDIAN, price_s=0.7)
+    agreed = replace(FILE, score=ScoreForm.SERVICE, price_s=0.7)
     assert wished(agreed, {}, {"tuning": replace(FILE, bonus=0.2)}) == replace(agreed, bonus=0.2)
     assert wished(agreed, {}, {"tuning": FILE}) is None
 
@@ -47,7 +47,6 @@ def test_a_changed_setting_is_wanted_and_the_others_stay_as_they_were_tuned() ->
     ("tuned", "before", "after"),
     [
         ({"price_s": 0.7}, {"price_s": 0.3}, {"price_s": 0.4}),
-        ({"cpu_floor_ratio": 0.2}, {}, {"cpu_floor_ratio": 0.1}),
         ({"reach": Reach.MAJORITY}, {}, {"reach": Reach.ALL}),
         ({"nu_dbm": -70.0}, {}, {"limits": LinkLimits(nu_dbm=-75.0)}),
         ({"rho_dbm": -30.0}, {}, {"limits": LinkLimits(rho_dbm=-45.0)}),
@@ -85,7 +84,7 @@ def test_a_tuning_that_comes_between_is_the_newer_word() -> None:
 
 def test_a_second_changed_file_does_not_end_what_the_first_one_wants() -> None:
     """No quorum, or another node's turn: the second file differs from the first one only in what was changed last."""
-    tunings = (FILE, replace(FILE, aggregate=Aggregate.MEDIAN), replace(FILE, aggregate=Aggregate.MEDIAN, bonus=0.2))
+    tunings = (FILE, replace(FILE, score=ScoreForm.SERVICE), replace(FILE, score=ScoreForm.SERVICE, bonus=0.2))
     first, second, third = (fleet_of(task_of(tuning=tuning)) for tuning in tunings)
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
     retuning = Retuning("edge2", InForce(fleet_of(task_of(tuning=FILE))))
@@ -125,7 +124,7 @@ def test_who_found_no_quorum_tries_again_and_ends_once_somebody_had_success() ->
 
 def test_a_second_file_wants_what_the_first_one_wanted_too() -> None:
     """Before the first wish is agreed the next file comes: neither change is lost, whichever is agreed first."""
-    tunings = FILE, replace(FILE, bonus=0.2), replace(FILE, bonus=0.2, aggregate=Aggregate.MEDIAN)
+    tunings = FILE, replace(FILE, bonus=0.2), replace(FILE, bonus=0.2, score=ScoreForm.SERVICE)
     files = [fleet_of(task_of(tuning=tuning)) for tuning in tunings]
     value = replace(allocation_of(5, "edge1"), tuning=FILE)
     retuning = Retuning("edge2", InForce(fleet_of(task_of(tuning=FILE))))

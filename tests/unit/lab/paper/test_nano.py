@@ -123,7 +123,6 @@ def test_every_program_s_demand_is_the_authors_and_its_worker_goes_to_the_tasks_
         share = AUTHORS["merge" if task.name == "map_merge" else "slam"]
         assert task.demand.cpu_cores == pytest.approx(share * scenario.full_cores, rel=0.02)
         assert task.worker.command[:3] == ("python", "-m", "zsched_lab.paper.work_group")
-        assert task.cpu_floor_ratio == (0.1 if task.name == "map_merge" else 0.0)
 
 
 def test_each_declared_block_is_all_that_its_scenario_runs() -> None:

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 from support.fleets import fleet_of, node_of
 from zsched.cli import app
 from zsched.commands.act.apply import make_plan
-from zsched.commands.base.change import InForce
 from zsched.commands.base.ask import Door
+from zsched.commands.base.change import InForce
 from zsched.config.load import check_file
 from zsched.core.values.errors import ConfigError
 from zsched.core.values.exits import EXIT_CONFIG

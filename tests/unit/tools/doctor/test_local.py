@@ -17,6 +17,7 @@ from support.clinic import FLEET, answer, assert_finds, make_state, run, scene_o
 from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
 from zsched import __version__
+from zsched.commands.base.places import Machine
 from zsched.config.load import check_file, load_fleet
 from zsched.core.values.codec import as_plain, document_hash
 from zsched.core.values.document import Document, Text
@@ -29,14 +30,14 @@ from zsched.host.operator_socket import OperatorSocket
 from zsched.host.radio.nl80211 import GenericNetlink, Interface
 from zsched.tools.doctor import look as looking
 from zsched.tools.doctor import machine, state
-from zsched.commands.base.places import Machine
 from zsched.tools.doctor.look import look
 from zsched.tools.doctor.model import Check, Scene, Verdict
 from zsched.tools.doctor.table import CHECKS, run_all
 
 FAIL, WARN, PASS, SKIP = Verdict.FAIL, Verdict.WARN, Verdict.PASS, Verdict.SKIP
 HERE = Path(__file__).parent
-FOUND = found_in(path for folder in (HERE, HERE.parents[2] / "parts" / "tools" / "doctor") for path in folder.glob("test_*.py"))
+BESIDE = HERE.parents[2] / "parts" / "tools" / "doctor"
+FOUND = found_in(path for folder in (HERE, BESIDE) for path in folder.glob("test_*.py"))
 ROBOTS_OWN = FLEET.replace("  robot1: {kind: robot}", "  robot1: {kind: robot, wifi: wlan7}")
 
 

@@ -17,8 +17,8 @@ from typer.testing import CliRunner, Result
 from support.doors import STATUS, answering, living
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.base.change import OrderView
 from zsched.commands.base.ask import Door
+from zsched.commands.base.change import OrderView
 from zsched.commands.base.common import CliError
 from zsched.core.values.errors import WireError
 from zsched.core.values.exits import EXIT_DEGRADED, EXIT_FAILED, EXIT_OK, EXIT_TIMED_OUT

@@ -32,8 +32,8 @@ from zsched.link.pipe import protocol
 HERE = Path(__file__).parent
 
 _WEIGHTS = model.Weights(cpu=0.5, memory=0.25, network=0.25)
-_TUNING = model.Tuning(weights=_WEIGHTS, bonus=0.125, aggregate=model.Aggregate.MEDIAN)
-"""Its frames hold a ``time_to_trigger_s`` as well, from when there was one: a field that is gone is read over."""
+_TUNING = model.Tuning(weights=_WEIGHTS, bonus=0.125)
+"""Its frames hold a ``time_to_trigger_s`` and an ``aggregate``, of before: a field that is gone is read over."""
 _VALUE = model.Allocation(
     task="map_merge", revision=7, epoch=4, owner="edge1", tuning=_TUNING, pinned=True, paused=True
 )

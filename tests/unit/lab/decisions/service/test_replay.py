@@ -144,9 +144,9 @@ def spec_of(seed: int) -> TaskSpec:
 
 
 def test_a_rule_may_be_described() -> None:
-    player = cast.described("hasty:smoothing_s=0.5,price_s=0.4,memory_s=50,aggregate=median")
+    player = cast.described("hasty:smoothing_s=0.5,price_s=0.4,memory_s=50,score=paper")
     assert (player.name, player.look.smoothing_s) == ("hasty", 0.5)
-    assert (player.tuning.aggregate, player.changes) == ("median", {"price_s": 0.4, "memory_s": 50.0})
+    assert (player.tuning.score, player.changes) == (ScoreForm.PAPER, {"price_s": 0.4, "memory_s": 50.0})
     assert cast.described("new:score=service").tuning.score is ScoreForm.SERVICE
     made = player.make(TaskView(scene(build(seed=3, hours=HOURS, load_s=0.0), 1.0, None), spec_of(3)))
     assert isinstance(made, CoreRule)
