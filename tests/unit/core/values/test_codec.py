@@ -17,10 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsched.core.electorate.founding import founded
-from zsched.core.membership.beat_room import MAX_BEAT_BYTES
 from zsched.core.values import codec as wire
 from zsched.core.values import document, messages, model
-from zsched.core.values.beat import Beat
+from zsched.core.values.beat import MAX_BEAT_BYTES, Beat
 from zsched.core.values.electorate import FleetValue
 from zsched.core.values.errors import WireError
 from zsched.core.values.profile import DeviceSample, Profile, WorkerLoad, WorkerState
