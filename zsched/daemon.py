@@ -53,6 +53,7 @@ from zsched.host.workers.hired import FOLDER, relay_socket
 from zsched.host.workers.supervisor import WorkerContext, WorkerSupervisor
 from zsched.link.bus.control_bus import ControlBus
 from zsched.link.bus.limits import in_turn_hz, limit_for
+from zsched.link.bus.sealing import seals_of
 from zsched.link.pipe.protocol import RelayHello
 from zsched.link.pipe.relay_socket import PROTOCOL, ask_relay
 from zsched.link.sessions import config as zenoh_config
@@ -60,7 +61,6 @@ from zsched.link.sessions import tls as daemon_tls
 from zsched.link.sessions.access_rules import Side, common_names_of, names_of
 from zsched.link.sessions.endpoints import DATA_PORT, Endpoints, claim_port, endpoints_for, free_port, is_here
 from zsched.link.sessions.memory import shared_memory_objection
-from zsched.link.sessions.sealing import seals_of
 from zsched.link.sessions.secured import CREDENTIALS, digest_of, require_own
 from zsched.link.sessions.zenoh_file import denied_by, operator_json5
 from zsched.runtime.access import StreamAccess, joins_at

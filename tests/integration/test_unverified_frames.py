@@ -52,11 +52,11 @@ from zsched.host.clock import monotonic_s
 from zsched.host.decision_log import DecisionLog
 from zsched.host.state_file import StateFile
 from zsched.link.bus.control_bus import ControlBus
+from zsched.link.bus.sealing import seals_of
 from zsched.link.bus.seals import Seals
 from zsched.link.keyspace import Keyspace
 from zsched.link.seal import Act
 from zsched.link.sessions.config import control_config
-from zsched.link.sessions.sealing import seals_of
 from zsched.runtime.desk import LOCAL_REQUESTS_FROM, Desk
 from zsched.runtime.inbox import Inbox
 from zsched.runtime.library import Library

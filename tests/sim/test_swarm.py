@@ -10,8 +10,9 @@ from random import Random
 
 import pytest
 
-from zsched.core.membership.beat_room import MAX_BEAT_BYTES, most_bytes
+from zsched.core.membership.beat_room import most_bytes
 from zsched.core.register.register import Register
+from zsched.core.values.beat import MAX_BEAT_BYTES
 from zsched.core.values.errors import InvariantError
 from zsched.core.values.fleet import Fleet
 from zsched.core.values.messages import Prepare, Promise, Refused

@@ -117,8 +117,8 @@ def test_named_files_exist(name: str) -> None:
 
 
 def test_planted_missing_file_is_found() -> None:
-    assert missing_files("`core/node/node.py` `tests/unit/core/test_{node,nothing}.py` `core/absent.py`") == [
-        "tests/unit/core/test_nothing.py",
+    assert missing_files("`core/node/node.py` `tests/unit/core/node/test_{node,nothing}.py` `core/absent.py`") == [
+        "tests/unit/core/node/test_nothing.py",
         "core/absent.py",
     ]
 

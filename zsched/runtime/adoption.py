@@ -20,10 +20,10 @@ from zsched.core.values.struct import Struct, field
 from zsched.host.workers.supervisor import WorkerSupervisor
 from zsched.link.bus.control_bus import ControlBus
 from zsched.link.bus.limits import limit_for
+from zsched.link.bus.sealing import orderers_of
 from zsched.link.sessions.access_rules import names_of
 from zsched.link.sessions.endpoints import Endpoints, endpoints_for
 from zsched.link.sessions.restarts import moved, opens_anew, restarts, waits_for
-from zsched.link.sessions.sealing import orderers_of
 from zsched.runtime.crew import Crew
 from zsched.runtime.recipes import Recipes
 from zsched.runtime.relay.streams import RelayHandle

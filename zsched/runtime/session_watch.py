@@ -21,11 +21,11 @@ from zsched.core.values.fleet import Fleet, NodeSpec
 from zsched.core.values.messages import CommandResult
 from zsched.core.values.model import NodeId
 from zsched.core.values.problems import Problem
+from zsched.link.bus.sealing import seals_of
 from zsched.link.sessions import tls as daemon_tls
 from zsched.link.sessions.access_rules import Side
 from zsched.link.sessions.endpoints import Endpoints, is_here
 from zsched.link.sessions.roaming import Roaming, addresses_towards, gone_from, numeric, places_of
-from zsched.link.sessions.sealing import seals_of
 from zsched.link.sessions.secured import digest_of, require_own
 from zsched.runtime import renewal
 from zsched.runtime.reopening import Moved, Reopening, first_wait_s, turns

@@ -14,7 +14,7 @@ FOUNDING: Final = "zsched.core.electorate.founding"
 INVITATION: Final = "zsched.link.invitation"
 
 
-def _bug(name: str, module: str, *changes: tuple[str, str], test: str = "runtime/test_membership.py") -> Bug:
+def _bug(name: str, module: str, *changes: tuple[str, str], test: str = "commands/members/test_membership.py") -> Bug:
     return Bug(name=name, module=module, changes=changes, tests=(f"tests/unit/{test}",), has_schedules=False)
 
 
@@ -65,12 +65,12 @@ MEMBER_BUGS: tuple[Bug, ...] = (
         "a changed invitation is taken",
         INVITATION,
         ('if body.pop("digest", None) != _digest(body):', 'if body.pop("digest", None) is None:'),
-        test="wire/test_invitation.py",
+        test="link/test_invitation.py",
     ),
     _bug(
         "an invitation's document is not compared with its value",
         INVITATION,
         ("if document_hash(document) != value.document:", "if not value.document:"),
-        test="wire/test_invitation.py",
+        test="link/test_invitation.py",
     ),
 )

@@ -618,7 +618,7 @@ STREAM_BUGS = (
     ),
     _bug(
         "a wait without an end lets no handler run",
-        "zsched.latch",
+        "zsched.host.latch",
         "timeout=min(SLICE_S, left_s)",
         "timeout=None if timeout_s is None else left_s",
         ("tests/unit/host/test_latch.py::test_a_signal_that_another_thread_has_releases_the_main_thread",),

@@ -16,11 +16,11 @@ from typer.testing import CliRunner, Result
 
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.act import fleet
 from zsched.commands.base import change as verbs
 from zsched.commands.base.ask import PASSES_ON
 from zsched.commands.base.change import DOCUMENT, InForce, OrderView, in_force
 from zsched.commands.base.common import CliError
+from zsched.commands.members import fleet
 from zsched.config.editing import add_entries
 from zsched.config.load import check_bytes
 from zsched.core.values.fleet import fleet_hash

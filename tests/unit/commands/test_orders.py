@@ -426,9 +426,9 @@ def test_an_order_that_is_not_agreed_says_so(daemon: Daemon, outcome: str, code:
 
 
 def test_a_tuning_is_shown_changed_and_set_back_to_the_file(daemon: Daemon) -> None:
-    assert run("tune", "echo", "bonus=0.3", "score=paper", "--yes").exit_code == 0
+    assert run("tune", "echo", "bonus=0.3", "reach=all", "--yes").exit_code == 0
     told = daemon.orders[0]["tuning"]
-    assert (told["bonus"], told["score"], told["weights"]["cpu"]) == (0.3, "paper", 0.5)
+    assert (told["bonus"], told["reach"], told["weights"]["cpu"]) == (0.3, "all", 0.5)
     daemon.status["tasks"][0]["tuning"] = {**TUNING, "bonus": 0.3}
     assert "bonus=0.3 (file: 0.1)" in run("tune", "echo").stdout
     body = json.loads(run("tune", "--json").stdout)

@@ -41,7 +41,7 @@ def dashboard() -> dict[str, Any]:
 def told() -> dict[str, set[str]]:
     """{name: its labels} of all that zsched tells, by another implementation's parser."""
     here = Path(__file__).parent
-    files = [*(here / "recorded_status").glob("*.json"), here / "watch" / "recorded" / "fleet.json"]
+    files = [*(here / "recorded_status").glob("*.json"), here.parent / "tools" / "watch" / "recorded" / "fleet.json"]
     found: dict[str, set[str]] = dict(FROM_PROMETHEUS)
     for file in files:
         for family in text_string_to_metric_families(metrics_text(json.loads(file.read_text()))):

@@ -142,7 +142,7 @@ def test_file_with_any_byte_changed_is_damaged(tmp_path: Path) -> None:
 def test_second_daemon_is_refused_and_told_who_holds_the_folder(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from zsched.host.state_file import StateFile\n"
-        "from zsched.errors import AdapterError\n"
+        "from zsched.core.values.errors import AdapterError\n"
         "try: StateFile(Path(sys.argv[1]), fleet='hall', node='robot1').acquire()\n"
         "except AdapterError as error: print(error)"
     )

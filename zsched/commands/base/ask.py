@@ -530,8 +530,8 @@ def _visit(endpoint: str, cell: Cell | None) -> _Visit:
         return _Visit(text="", asker=asker, fleet=any_fleet)
     from zsched.config.load import load_fleet  # noqa: PLC0415 - ruamel.yaml is slow to import
     from zsched.core.values.certificates import Role  # noqa: PLC0415 - as above
+    from zsched.link.bus.sealing import seals_of  # noqa: PLC0415 - as above
     from zsched.link.sessions.access_rules import Side  # noqa: PLC0415 - as above
-    from zsched.link.sessions.sealing import seals_of  # noqa: PLC0415 - as above
     from zsched.link.sessions.secured import identity_of  # noqa: PLC0415 - as above
     from zsched.link.sessions.tls import session_text  # noqa: PLC0415 - as above
 

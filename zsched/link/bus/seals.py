@@ -52,7 +52,7 @@ class SealFault(StrEnum):
 
 
 class Keys(Struct, frozen=True, kw_only=True):
-    """What signs and checks, from the certificates of this machine (`zsched.link.sessions.sealing` makes it)."""
+    """What signs and checks, from the certificates of this machine (`zsched.link.bus.sealing` makes it)."""
 
     sign: Callable[[bytes], bytes]
     certificate: bytes

@@ -21,10 +21,10 @@ from zsched.core.values.errors import ConfigError
 from zsched.core.values.fleet import Security
 from zsched.host.clock import wall_ns
 from zsched.host.files import read_regular
+from zsched.link.bus.sealing import seals_of
 from zsched.link.sessions.certificate import common_names, validities
 from zsched.link.sessions.config import tls_settings
 from zsched.link.sessions.own_addresses import Address, addresses_at
-from zsched.link.sessions.sealing import seals_of
 from zsched.link.sessions.secured import CERTIFICATE, files_by, require_own
 from zsched.link.sessions.tls import ENCRYPTED, protocol_of
 from zsched.link.sessions.zenoh_file import operator_json5

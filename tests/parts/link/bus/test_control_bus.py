@@ -59,8 +59,8 @@ from zsched.host.clock import monotonic_s
 from zsched.link.bus import control_bus, open_questions
 from zsched.link.bus.control_bus import RING, ControlBus, signed_by
 from zsched.link.bus.open_questions import Questions
+from zsched.link.bus.sealing import orderers_of, seals_of
 from zsched.link.sessions.config import control_config
-from zsched.link.sessions.sealing import orderers_of, seals_of
 
 T = TypeVar("T")
 TIMING = Timing()

@@ -1293,7 +1293,7 @@ GOLDEN = {
     "nodes[].workers[]": "task state cpu_cores memory_mb",
     "tasks[]": "name owner epoch revision since_s owner_state phase tuning candidates decision vote streams history "
     "problems",
-    "tasks[].tuning": "weights bonus aggregate",
+    "tasks[].tuning": "weights bonus",
     "tasks[].tuning.weights": "cpu memory network",
     "tasks[].decision": "outcome winner reason age_s aggregates utilities vetoed silent",
     "tasks[].decision.aggregates": "*",

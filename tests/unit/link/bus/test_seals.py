@@ -17,10 +17,10 @@ from zsched.core.values.certificates import Role
 from zsched.core.values.errors import ConfigError, WireError
 from zsched.core.values.fleet import Fleet, Security, Signatures
 from zsched.link.bus import seals as module
+from zsched.link.bus.sealing import seals_of
 from zsched.link.bus.seals import Seals, nonce
 from zsched.link.keyspace import Keyspace
 from zsched.link.seal import Act, pack, unpack
-from zsched.link.sessions.sealing import seals_of
 
 KEYS = Keyspace("yard")
 PUT = KEYS.proposal("robot1")
