@@ -81,7 +81,7 @@ def paper(
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the results.")] = Path("zsched-paper"),
     scenario: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A file, or a declared block (nano, heavy-oracle). [paper]")
+        Path | None, typer.Option(metavar="FILE", help="A file, or a declared block (nano, heavy-all). [paper]")
     ] = None,
     log: Annotated[Path | None, typer.Option(metavar="FILE", help="CARMEN laser log. [Malaga, shipped]")] = None,
     drives: Annotated[Path | None, typer.Option(metavar="DIR", help="Recorded radio drives. [simulated]")] = None,

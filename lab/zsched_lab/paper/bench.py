@@ -33,7 +33,6 @@ from zsched_lab.paper.robots import ExploreRobots, LogRobots, Robots, slam_task
 from zsched_lab.paper.run import CellRun, Inputs, machine_text, write_json
 from zsched_lab.paper.scenario import MATRIX, Scenario, load_scenario
 from zsched_lab.paper.schemes import QUICK_SCHEMES
-from zsched_lab.paper.snippet import snippet
 
 RESULTS_SCHEMA = "zsched.paper/1"
 QUICK_S = 34.0
@@ -268,7 +267,7 @@ def claim_folder(options: BenchOptions, body: Mapping[str, Any]) -> str | None:
 
 
 def conclude(options: BenchOptions, scenario: Scenario, inputs: InputsOf, cells: Sequence[Cell], rest: Rest) -> int:
-    """Write results.json, report.md, readme.md and the pictures out of what is in the folder."""
+    """Write results.json, report.md and the pictures out of what is in the folder."""
     runs, invalid = collect(options.out, cells)
     results = {
         "schema": RESULTS_SCHEMA,
@@ -313,14 +312,13 @@ def report_again(out: Path) -> int:
 
 
 def _write_report(out: Path) -> None:
-    """Write report.md, readme.md and the pictures of a folder's results.json."""
+    """Write report.md and the pictures of a folder's results.json."""
     results = read_json(out / RESULTS)
     scenario, level = results["scenario"], main_level(results)
     title = f"{scenario['name']}, load {level}, seed {scenario['seed']}, {results['input']}"
     drawn = save_all(in_block(results["runs"], scenario["main"]), level, tuple(scenario["levels"]), out, title)
     drawn += block_pictures(results, out)
     (out / "report.md").write_text(report(results, drawn), encoding="utf-8")
-    (out / "readme.md").write_text(snippet(results, drawn), encoding="utf-8")
     print(f"{out / 'report.md'}: {len(results['runs'])} runs")
 
 

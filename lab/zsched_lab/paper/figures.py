@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from zsched_lab.demo.plots import COLOURS, DPI
-from zsched_lab.paper.claims import over, shared
+from zsched_lab.paper.claims import Difference, over, shared
 from zsched_lab.paper.schemes import SCHEMES, Family
 
 Json = Mapping[str, Any]
@@ -37,10 +37,10 @@ WITH_YARDSTICKS = (
     ("regret", "regret", "regret against the oracle"),
 )
 GAIN_LABELS = {
-    "throughput_mb_s": "throughput, % of fixed",
     "map_hz": "merged maps per second, %",
-    "task_latency_s": "task latency, % (less is better)",
     "merge_latency_p95_s": "merge latency p95, % (less is better)",
+    "task_latency_s": "task latency, % (less is better)",
+    "coverage_mean": "covered on the way, %",
 }
 
 
@@ -90,6 +90,11 @@ def save_gains(path: Path, groups: Mapping[str, Sequence[Json]], title: str) -> 
     ``None``, and no picture, where no group has enough runs.
     """
     found = {(name, scheme): over(runs, scheme) for name, runs in groups.items() for scheme in ("oracle", "zsched")}
+    return save_rows(path, {(f"{name}: {scheme}", scheme): found[name, scheme] for name, scheme in found}, title)
+
+
+def save_rows(path: Path, found: Mapping[tuple[str, str], Mapping[str, Difference]], title: str) -> str | None:
+    """Differences in `GAIN_LABELS` with their intervals: {(what stands beside a row, its scheme): differences}."""
     rows = [key for key, known in found.items() if known]
     if not rows:
         return None
@@ -106,7 +111,7 @@ def save_gains(path: Path, groups: Mapping[str, Sequence[Json]], title: str) -> 
         axes.axvline(0.0, color="#999999", linewidth=0.8)
         axes.set_xlabel(label, fontsize=8)
         axes.tick_params(labelsize=8)
-    panels[0].set_yticks(range(len(rows)), [f"{name}: {scheme}" for name, scheme in rows], fontsize=8)
+    panels[0].set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=8)
     figure.suptitle(title, fontsize=8, color="#666666", x=0.01, ha="left")
     FigureCanvasAgg(figure).print_figure(path)
     return path.name

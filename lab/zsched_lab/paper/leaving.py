@@ -2,7 +2,7 @@
 
 Knows: a bench's results, when load was planned. Does not know: processes, why a task moved.
 
-    python -m zsched_lab.paper.leaving docs/evaluation/heavy-again.json
+    python -m zsched_lab.paper.leaving docs/evaluation/heavy-calm.json
 
 A move counts when the edge that it leaves is loaded at that moment. The injected process takes a moment to start, and
 that moment counts, too.

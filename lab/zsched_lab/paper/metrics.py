@@ -44,7 +44,7 @@ WASTED_S = 30.0
 WORLD = Pose2()
 HELD_EVERY_S = 5.0
 FRESH_S = 0.5
-"""A robot is served while its newest merged map is at most this old (`docs/evaluation/nano.md`, ``heavy_all``)."""
+"""A robot is served while its newest merged map is at most this old (chosen in ``heavy_all``, before its runs)."""
 Json = dict[str, Any]
 WALL_M = 0.1
 """So far may a wall be off: two cells of `nano`'s maps, twice the error of a robot's pose."""

@@ -43,7 +43,7 @@ from zsched_lab.paper.tables import (
 
 PROMISE = (
     "For readers who want the figures: what placing gains, and for every claim of the paper and every goal of ours an "
-    "interval and a verdict. [README](README.md) defines every figure; `results.json` has the figures of every run.\n"
+    "interval and a verdict. docs/evaluation/README.md defines every figure; `results.json` has those of every run.\n"
 )
 PAIRED = "Differences are relative, between the same runs, with 95 % intervals (Student's t).\n"
 NOT_COMPARED = (
@@ -67,12 +67,6 @@ FOLLOWS_DB = 1.5
 FOLLOWS_RULE = (
     f"(At most {FOLLOWS_DB:g} dB under the best robot of every moment, and above the best single one; one drive.)"
 )
-FLOORS = {MATRIX: (-0.08, -0.22, 0.06), "heavy": (-0.17, -0.27, -0.06), "heavy_again": (-0.14, -0.22, -0.07)}
-"""{block: the task latency of a merger that costs nothing, against fixed placement, with its interval}: an estimate.
-
-`zsched_lab.paper.latency_floor` printed them of docs/evaluation/results.json and heavy-again.json, and says what it is.
-"""
-LATENCY_GOAL = -0.28
 
 
 # --- the text --------------------------------------------------------------------------------------------------------
@@ -92,7 +86,6 @@ def report(results: Json, pictures: Sequence[str]) -> str:
         *gains_parts(results, pictures),
         "## The claims\n",
         claims_text(groups),
-        floors_text(groups),
         memory_text(main),
         NOT_COMPARED,
         "## No scheme of the paper better than ours?\n",
@@ -177,24 +170,6 @@ def claims_text(groups: Mapping[str, Sequence[Json]]) -> str:
         fewest, most = min(counts), max(counts)
         lines += ["", f"Paired runs of each claim: {fewest if fewest == most else f'{fewest} to {most}'}."]
     return "\n".join(lines) + "\n"
-
-
-def floors_text(groups: Mapping[str, Sequence[Json]]) -> str:
-    """How much of the task latency a merger that costs nothing gains, by estimate, where that is known; else empty."""
-    known = {str(runs[0].get("block", MATRIX)): name for name, runs in groups.items() if runs}
-    floors = {name: FLOORS[block] for block, name in known.items() if block in FLOORS}
-    if not floors:
-        return ""
-    means = ", ".join(f"{-mean:.0%} ({name})" for name, (mean, _, _) in floors.items())
-    intervals = ", ".join(f"[{100 * low:+.0f}, {100 * high:+.0f}]" for _, low, high in floors.values())
-    beyond = [name for name, (_, low, _) in floors.items() if low > LATENCY_GOAL]
-    told = f" The claim and the goal of {LATENCY_GOAL:.0%} lie outside ({', '.join(beyond)})." if beyond else ""
-    text = (
-        f"In the published runs a merger that costs nothing gains {means} of the task latency, by an estimate in "
-        f"virtual time with the 95% intervals {intervals}.{told} It is no bound: a scheme of few runs may be better by "
-        "luck.\n"
-    )
-    return text.replace("%", " %")
 
 
 def gains_parts(results: Json, pictures: Sequence[str] = ()) -> list[str]:

@@ -48,7 +48,7 @@ def test_the_seed_decides_everything(world: World, fresh: list[VirtualResult]) -
 
 
 def test_a_late_merged_map_costs_more_than_its_lateness(world: World, fresh: list[VirtualResult]) -> None:
-    """Else the robots would not plan on it. docs/evaluation/exploration.md has the figures of a larger world."""
+    """Else the robots would not plan on it. docs/evaluation/method.md has the figures of a larger world."""
     for seed, sooner in zip(SEEDS, fresh, strict=True):
         later = run_virtual(VirtualRun(world=world, seed=seed, delay_s=LATE_S))
         assert later.time_s is not None

@@ -38,7 +38,6 @@ from zsched_lab.paper.report import (
     report,
 )
 from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
-from zsched_lab.paper.snippet import snippet
 
 EVALUATION = Path(__file__).parents[4] / "docs" / "evaluation"
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
@@ -150,10 +149,6 @@ def test_rows_are_compared_over_the_runs_that_all_have() -> None:
     assert shared([], "scheme") == []
 
 
-def kept(outcome: Verdict) -> bool:
-    return outcome in {Verdict.REPRODUCED, Verdict.EXCEEDED}
-
-
 def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
     runs = [a_run(name, run, throughput_mb_s=10.0) for name in FIXED_SCHEMES for run in range(3)]
     runs += [a_run(name, run, throughput_mb_s=15.0) for name in PAPER_SCHEMES for run in range(3)]
@@ -163,8 +158,6 @@ def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
 
     assert verdicts["throughput +40 % over fixed"] is Verdict.EXCEEDED
     assert verdicts["zsched: throughput at least +40 % over fixed"] is Verdict.NOT_REPRODUCED
-    shown = snippet({"command": "x", "scenario": {"seed": 1, "level": "one"}, "runs": runs}, [])
-    assert f"{sum(kept(outcome) for outcome in verdicts.values())} of {len(CLAIMS)} claims hold, 0 could" in shown
     assert {metric for _, metric, _ in better_than_ours(runs)} == {"throughput_mb_s"}
     assert {scheme for scheme, _, _ in better_than_ours(runs)} == set(PAPER_SCHEMES)
     assert all(set(claim.mine) | set(claim.theirs) <= set(SCHEMES) for claim in CLAIMS)
@@ -210,9 +203,7 @@ def test_what_was_dropped_stands_beside_what_was_lost_by_reason() -> None:
     assert "fixed_e1" not in text
     assert losses_text({"matrix (one)": runs[2:3]}).endswith("\n\nNothing was lost or dropped.\n")
     results = json.loads((EVALUATION / "results.json").read_text(encoding="utf-8"))
-    said = losses_text(groups_of(results))
-    assert said in (EVALUATION / "report.md").read_text(encoding="utf-8")
-    assert said in report(results, [])
+    assert losses_text(groups_of(results)) in report(results, [])
 
 
 @pytest.mark.parametrize(
@@ -228,8 +219,6 @@ def test_a_run_that_ended_because_it_was_done_is_named_where_it_counts_as_not_do
     said = ended_text(runs, results["scenario"])
 
     assert said.endswith(f": {told}.\n")
-    page = EVALUATION / ("report.md" if file == "results.json" else "heavy-again.md")
-    assert said in page.read_text(encoding="utf-8")
     longest = [{**one, "duration_s": results["scenario"]["duration_s"]} for one in runs]
     assert ended_text(longest, results["scenario"]) == "", "of those whose time was over nothing is known"
 
@@ -325,11 +314,6 @@ def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) ->
     assert "No valid run of 1 cells: one-random-3." in text
     assert "in any run: zsched 0.60, fixed 0.60." in text
     assert "plain SSIM" not in text, "results.json has it"
-    shown = snippet(results, pictures)
-    assert all(claim.says in shown for claim in CLAIMS)
-    assert f"0 of 0 claims hold, {len(CLAIMS)} could not be judged" in shown
-    assert "docs/evaluation/gains.png" in snippet(results, [*pictures, "gains.png"])
-    assert "docs/evaluation/gains.png" not in shown
     assert "| maps/s | zsched | 2.00 | 2.50 |" in text
     assert "one-zsched-1: pressure 0.50" in text
     assert "-55.0" in text

@@ -37,13 +37,10 @@ def test_a_move_counts_when_the_edge_that_it_leaves_is_loaded() -> None:
     assert line.split(maxsplit=1) == ["zsched", "1.0 to 4.0 s, median 2.5; 1 of 2 moves within 3 s"]
 
 
-def test_the_times_on_the_page_are_those_of_its_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_times_of_a_published_record_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(RESULTS)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(maxsplit=1) for line in lines[1:]] == [
         ["dyna_both", "0.8 to 1.6 s, median 1.2; 11 of 11 moves within 3 s"],
         ["zsched", "1.3 to 3.7 s, median 2.1; 10 of 12 moves within 3 s"],
     ]
-    page = (RESULTS.parent / "heavy-again.md").read_text(encoding="utf-8")
-    assert "1.3 to 3.7 s (median 2.1; 10 of 12 moves within the goal of 3 s)" in page
-    assert "0.8 to 1.6 s (median 1.2; 11 of 11)" in page

@@ -1,4 +1,4 @@
-"""The blocks that were declared before their runs (`nano`, `nano_moves`, `heavy_again`), and what is said of them."""
+"""The blocks that were declared before their runs (`nano`, `nano_moves`, `heavy_all`), and what is said of them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,6 @@ from zsched_lab.paper.claims import (
     over_best_fixed,
 )
 from zsched_lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage, stood_text
-from zsched_lab.paper.latency_floor import ceiling_of, floor_of, tell_ceiling
-from zsched_lab.paper.latency_floor import main as latency_floor
 from zsched_lab.paper.led_metrics import (
     coverage_figures,
     led_of,
@@ -49,7 +47,6 @@ from zsched_lab.paper.report import (
     MOVING_SAY,
     better_text,
     blocks_parts,
-    floors_text,
     gains_parts,
     gains_text,
     main_runs,
@@ -60,7 +57,6 @@ from zsched_lab.paper.roles import REST, RoleMeter, mean_shares, role_figures
 from zsched_lab.paper.run import CellRun, Inputs
 from zsched_lab.paper.scenario import MATRIX, NodeShare, Scenario, load_scenario
 from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
-from zsched_lab.paper.snippet import moves_text
 
 AUTHORS = {"slam": 0.352, "model": 0.60, "merge": 0.096, "navigation": 0.027}
 """Shares of a Jetson Nano's CPU: config/task_req.yaml of herolab-uga/ros-edge-orchestration, rounded."""
@@ -84,10 +80,7 @@ def options(tmp_path: Path, name: str, **given: Any) -> BenchOptions:
 
 def test_the_shipped_scenarios_are_found_by_name_and_nothing_else_is() -> None:
     assert shipped_names() == (
-        "heavy-again",
         "heavy-all",
-        "heavy-calm",
-        "heavy-oracle",
         "nano",
         "nano-again",
         "nano-moves",
@@ -130,10 +123,7 @@ def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
         "nano": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_cpu", "dyna_mem", "dyna_both", "zsched"), 5),
         "nano-again": (("fixed_e1", "dyna_cpu", "dyna_both", "zsched"), 5),
         "nano-moves": (("dyna_both", "dyna_both_slam", "zsched", "zsched_slam"), 5),
-        "heavy-again": (("fixed_e1", "fixed_e2", "fixed_e3", "dyna_both", "zsched"), 8),
-        "heavy-oracle": (("dyna_both", "zsched", "oracle"), 8),
         "heavy-all": ((*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched", "oracle"), 5),
-        "heavy-calm": ((*FIXED_SCHEMES, "dyna_cpu", "dyna_both", "zsched", "oracle"), 4),
     }
     limits, seeds = set(), set(range(20260, 20260 + 100))
     for name, (schemes, runs) in wanted.items():
@@ -151,15 +141,14 @@ def test_each_declared_block_is_all_that_its_scenario_runs() -> None:
 
 
 def test_every_second_run_takes_the_schemes_in_reverse() -> None:
-    scenario = shipped("heavy-again")
+    scenario = shipped("heavy-all")
     order = [[cell.scheme.name for cell in cells_of(scenario, ()) if cell.run == run] for run in range(3)]
     assert order[0] == order[2] == order[1][::-1]
     assert abs(order[0].index("zsched") - order[0].index("dyna_both")) == 1
 
 
-@pytest.mark.parametrize("name", ["heavy-again", "heavy-oracle", "heavy-all", "heavy-calm"])
-def test_heavy_again_is_heavy(name: str) -> None:
-    paper, again = load_scenario(scenario_path()), shipped(name)
+def test_heavy_with_all_schemes_is_heavy() -> None:
+    paper, again = load_scenario(scenario_path()), shipped("heavy-all")
     heavy = paper.blocks["heavy"]
     assert again.merge == replace(paper.merge, **heavy.merge)
     assert again.explore == replace(paper.explore, world=heavy.world or "")
@@ -701,76 +690,8 @@ def test_zsched_stands_beside_schemes_that_move_also_where_no_fixed_one_was_run(
     assert gains_parts(results_of([one for one in moving if one["scheme"] == "zsched"])) == []
 
 
-def test_schemes_stand_where_they_stand_behind_what_moves_cost() -> None:
+def test_schemes_stand_where_they_stand() -> None:
     results = results_of(the_runs())
     table = gains_text(results, ("zsched", "dyna_both", "oracle"))
     rows = [line.split(" | ")[1] for line in table.splitlines()[2:]]
     assert rows == ["dyna_both", "zsched"]
-    assert "| nano | 6 in 3 runs | 0.20 | 0.30 | 0.00 |" in moves_text(results)
-    assert moves_text(results_of([{**one, "moves": 0} for one in the_runs()])) == ""
-
-
-@pytest.mark.parametrize(
-    ("block", "told"), [("matrix", "8 %"), ("heavy", "17 %"), ("heavy_again", "14 %"), ("nano", "")]
-)
-def test_the_floor_stands_below_the_goals_for_the_latency(block: str, told: str) -> None:
-    runs = [{**one, "block": block, "task_latency_s": 30.0} for one in the_runs()]
-    text = floors_text({block: runs})
-    says = f"In the published runs a merger that costs nothing gains {told} ({block}) of the task latency"
-    assert text.startswith(says if told else "")
-    assert bool(text) == bool(told)
-    assert ("It is no bound" in text) == bool(told)
-    assert (f"of -28 % lie outside ({block})." in text) == bool(told)
-    assert text in report(results_of(runs, block), [])
-
-
-def test_the_ceiling_of_coverage_is_told_before_and_after_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    loop = {"world": "turtlebot3", "speed": 0.5, "duration_s": 4.0, "map_period_s": 2.0}
-    merge = {"rate_hz": 0.5, "min_agreeing": 150}
-    scenario = {"seed": 1, "warm_up_s": 1.0, "explore": loop, "merge": merge, "blocks": {}}
-    runs = [{"scheme": name, "run": 0, "coverage_mean": 0.1} for name in FIXED_SCHEMES]
-
-    found = ceiling_of(scenario, runs)
-
-    assert found is not None
-    assert found[0] == pytest.approx(0.1)
-    assert 0.1 < found[1] < 1.0
-    assert found[2].endswith("(n = 1)")
-    short = replace(shipped("nano"), duration_s=5.0, warm_up_s=0.0)
-    short = replace(
-        short,
-        explore=replace(short.explore, duration_s=5.0, world="turtlebot3"),
-        blocks={"nano": replace(short.blocks["nano"], runs=1)},
-    )
-    assert tell_ceiling(short) == 0
-    assert capsys.readouterr().out.startswith("seed 44000: covered on the way 0.")
-    for wrong in ([], ["--scenario", "paper"], ["--scenario", "nono"], ["x.json", "--scenario", "nano"]):
-        with pytest.raises(SystemExit):
-            latency_floor(wrong)
-
-
-def test_the_floor_is_what_robots_do_with_maps_that_come_at_once() -> None:
-    runs = [
-        {"scheme": name, "block": MATRIX, "run": run, "task_latency_s": 22.0 + run}
-        for name in FIXED_SCHEMES
-        for run in range(2)
-    ]
-    loop = {"world": "turtlebot3", "speed": 1.0, "duration_s": 20.0, "target_coverage": 0.5}
-    scenario = {"seed": 1, "blocks": {}, "explore": loop}
-
-    found = floor_of(scenario, runs)
-
-    assert found is not None
-    assert found[0] == 22.5
-    assert 0.0 < found[1] < 20.0
-    assert found[2].startswith("-")
-    slow = floor_of({**scenario, "merge": {"rate_hz": 0.5}}, runs)
-    assert slow is not None
-    assert slow[1] > found[1], "the merger's own rate counts"
-    warm = floor_of({**scenario, "warm_up_s": 5.0, "blocks": {MATRIX: {"merge": {"rate_hz": 20.0}}}}, runs)
-    assert warm is not None
-    assert warm[1] < slow[1], "a block's own rate counts, and the drive begins with a map"
-    never = floor_of({**scenario, "explore": {**loop, "target_coverage": 1.0, "duration_s": 5.0}}, runs)
-    assert never is not None
-    assert never[1] == 5.0
-    assert floor_of(scenario, runs[:1]) is None

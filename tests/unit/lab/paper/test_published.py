@@ -42,7 +42,7 @@ def test_what_is_published_is_reported_with_what_made_it_whatever_the_other_opti
 
 
 def test_older_figures_stand_as_they_were(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    copied("nano.json", tmp_path / "out")
+    copied("heavy-oracle.json", tmp_path / "out")
     assert reported(tmp_path / "out") == 0
     assert "figures by definitions 5, today's are 6" in capsys.readouterr().err
 
