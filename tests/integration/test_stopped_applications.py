@@ -132,18 +132,21 @@ def test_what_one_on_the_fleets_own_side_misses_is_counted(tmp_path: Path) -> No
         app = Application(rig.app)
         flowing(rig, app, 100)
         reader = Reader(READER, tmp_path / "reader", client_config(connect=(rig.endpoint(ROBOT),), timing=MINUTE))
+
+        def missed() -> int:
+            return app.sent - reader.numbers[0] - len(reader.numbers)
+
         try:
             thread = app.stream(HZ)
             for _ in range(TRIES):  # now and then zenoh reads first, and its link stays
                 until(lambda: reader.numbers[-1:] > [app.sent - 20], "it goes on")
                 stop_for(reader, 3.0)
                 until(lambda: reader.numbers[-1] > app.sent - 20, "it goes on")
-                if app.sent - reader.numbers[0] - len(reader.numbers) > 2 * HZ:
+                if missed() > 2 * HZ:
                     break
             app.halt(thread)
-            until(lambda: reader.numbers[-1] == app.sent - 1, "the newest answer")
-            missed = app.sent - reader.numbers[0] - len(reader.numbers)
-            assert missed > 2 * HZ, "it ended its link"
-            until(lambda: dict(rig.told("echo/out/0").drops).get("slow_reader", 0) >= missed, "what it missed")
+            # The newest answer may be among those that it missed, so it is not waited for.
+            until(lambda: dict(rig.told("echo/out/0").drops).get("slow_reader", 0) >= missed(), "what it missed")
+            assert missed() > 2 * HZ, "it ended its link"
         finally:
             reader.end()
