@@ -24,10 +24,3 @@ def test_a_price_trades_signal_for_calm() -> None:
     assert least.moves > most.moves > 0.0
     assert found["argmax"].moves > 3 * least.moves
     assert 0.0 < found["argmax"].under_db < most.under_db
-
-
-@pytest.mark.parametrize("wrong", [["--drives", "1"], ["--seeds", "nono"]])
-def test_wrong_options_are_usage(wrong: list[str]) -> None:
-    with pytest.raises(SystemExit) as told:
-        halls.main(wrong)
-    assert told.value.code == 2

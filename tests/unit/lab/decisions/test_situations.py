@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from zsched_lab.decisions.situations import BANDS, BEFORE_S, SITUATIONS, Next, Situation, main, play
+from zsched_lab.decisions.situations import BANDS, BEFORE_S, SITUATIONS, Next, Situation, play
 
 Move = tuple[str, float, float, str]
 STAYS = None
@@ -23,11 +23,6 @@ FOLLOWED: dict[str, dict[str, Move | None]] = {
     "an exclusive owner that rests, and nobody else can": {"map": STAYS},
 }
 """{situation: {task: where it goes, within which seconds, for which reason}}; no answer is near the end of its band."""
-
-
-def test_there_are_ten() -> None:
-    assert [one.name for one in SITUATIONS] == list(FOLLOWED)
-    assert len(SITUATIONS) == 10
 
 
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.name)
@@ -53,16 +48,3 @@ def holds(told: Next, expected: Move | None) -> None:
     assert least_s <= after_s <= most_s
     assert sum(end <= least_s for end in BANDS) == sum(end <= most_s for end in BANDS), "one answer of the question"
     assert reason in why
-
-
-def test_the_answers_are_printed_only_where_they_are_asked_for(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("zsched_lab.decisions.situations.SITUATIONS", SITUATIONS[:1])
-    assert main([]) == 0
-    asked = capsys.readouterr().out
-    assert "Where will map be 10 s after that screen?" in asked
-    assert "ANSWER" not in asked
-    assert SITUATIONS[0].name not in asked
-    assert main(["--answers"]) == 0
-    assert "10 s later is at edge1" in capsys.readouterr().out

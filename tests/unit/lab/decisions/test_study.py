@@ -9,10 +9,7 @@ from pathlib import Path
 import pytest
 
 from zsched_lab.decisions import __main__ as package
-from zsched_lab.decisions import report, study
-from zsched_lab.decisions.drives import DriveFigures
-from zsched_lab.decisions.figures import grid as grid_picture
-from zsched_lab.decisions.figures import rules as rules_picture
+from zsched_lab.decisions import study
 
 ONLY = frozenset({"zsched", "argmax", "fixed_e1"})
 CASES = tuple(case for case in study.compared((3,)) if case.name in ("long", "step"))
@@ -61,47 +58,6 @@ def test_every_rule_and_the_oracle_have_a_line_for_every_history(results: Path) 
 
 def test_seeds_for_choosing_and_for_checking_are_different() -> None:
     assert not set(study.TRAIN) & set(study.TEST)
-
-
-def test_the_tables_say_what_the_results_say(results: Path, tmp_path: Path) -> None:
-    rows = study.read(results)
-    figures = DriveFigures(rule="oracle", moves=3, wasted=1, mean_dbm=-50.0, weak=0.25, delay_ms=30.0)
-    report.write(rows, {"drives": [figures]}, tmp_path / "report.md")
-    text = (tmp_path / "report.md").read_text()
-    regrets = [100 * float(row["regret"]) for row in report.of(rows, "long", "fixed_e1")]
-    mean, spread = report.mean_and_spread(regrets)
-    assert f"| fixed_e1 | {mean:.2f} ± {spread:.2f} | 0.0 | 0.0 |" in text
-    assert "| zsched | 1 of 1 |" in text
-    assert "| fixed_e1 | 0 of 1 | - | - |" in text
-    assert "| oracle | 3 | 1 | -50.0 | 0.00 | 25.0 | 30.0 |" in text
-    assert text.index("| oracle |") < text.index("| zsched |") < text.index("| argmax |")
-
-
-def test_the_grid_is_ranked_by_what_was_played_of_it(tmp_path: Path) -> None:
-    """A run of some cases of the sweep has its table and its picture, too."""
-    regrets = {"long": {"s1 b0.03 p0.1 c5": 0.03, "s3 b0.03 p0.1 c5": 0.01, "oracle": 0.0}, "equal": {"oracle": 0.0}}
-    rows = [
-        {"case": f"sweep {case}", "seed": 1, "rule": rule, "regret": regret, "moves": 2, "wasted": 0, "hours": 1.0}
-        for case, rules in regrets.items()
-        for rule, regret in rules.items()
-    ]
-    assert report.grid_regrets(rows) == {"s1 b0.03 p0.1 c5": 0.03, "s3 b0.03 p0.1 c5": 0.01}
-    table = report.sweep_table(rows)
-    assert table.index("| s3 b0.03 p0.1 c5 | 1.00 | - | 1.00, 2.0 |") < table.index("| s1 b0.03 p0.1 c5 | 3.00 |")
-    grid_picture(rows, tmp_path / "grid.png")
-    assert (tmp_path / "grid.png").stat().st_size > 10_000
-
-
-def test_the_picture_is_drawn(results: Path, tmp_path: Path) -> None:
-    rules_picture(study.read(results), tmp_path / "rules.png")
-    assert (tmp_path / "rules.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_spread_is_two_standard_errors_of_the_mean() -> None:
-    assert report.mean_and_spread([2.0]) == (2.0, 0.0)
-    mean, spread = report.mean_and_spread([1.0, 2.0, 3.0])
-    assert mean == 2.0
-    assert spread == pytest.approx(1.96 / 3**0.5)
 
 
 def test_the_command_refuses_to_mix_results_unless_told_to_resume(

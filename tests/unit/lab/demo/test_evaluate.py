@@ -11,7 +11,6 @@ from zsched.tasks.map_merge.cdr import encode_grid
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from zsched_lab.demo.evaluate import RunFacts, evaluate, print_summary
-from zsched_lab.demo.plots import Timeline, difference, on_one_canvas, save_timeline, windowed_rate
 from zsched_lab.fleet.recorder import Follower
 from zsched_lab.fleet.view import Load, Move
 from zsched_lab.robots.watch import RobotWatch
@@ -126,29 +125,3 @@ def test_in_mode_estimate_the_map_lies_in_the_reference_robots_frame(tmp_path: P
     give_map(tmp_path, Grid(data=seen.data, resolution=seen.resolution, origin=frame))
 
     assert evaluate(facts)["wall_f1"] == 1.0
-
-
-def test_the_difference_shows_missing_and_extra_walls() -> None:
-    truth = a_room()
-    data = truth.data.copy()
-    data[40:46, 50:56] = FREE
-    data[60:66, 80:86] = OCCUPIED
-    merged = Grid(data=data, resolution=truth.resolution, origin=truth.origin)
-
-    picture = difference(*on_one_canvas(truth, merged, Pose2()), 1)
-
-    colours = {tuple(np.round(colour * 255).astype(int)) for colour in picture.reshape(-1, 3)}
-    assert (0, 0x72, 0xB2) in colours
-    assert (0xD5, 0x5E, 0) in colours
-
-
-def test_arrivals_per_second_of_the_window_before() -> None:
-    assert windowed_rate([1.0, 2.0, 3.0], np.array([0.0, 3.0, 6.0, 9.0])) == [0.0, 1.0, 0.0, 0.0]
-
-
-def test_a_timeline_with_nothing_in_it_is_drawn(tmp_path: Path) -> None:
-    empty = Timeline(title="t", duration_s=10.0, candidates=("edge1",), moves=(), loads=(), cpu={}, maps={})
-
-    save_timeline(tmp_path / "t.png", empty)
-
-    assert (tmp_path / "t.png").stat().st_size > 1000

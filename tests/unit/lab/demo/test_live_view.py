@@ -2,13 +2,11 @@ from __future__ import annotations
 
 import io
 
-import numpy as np
 import pytest
 from rich.console import Console
 
-from zsched_lab.demo.live_view import PlainLines, cpu_bar, make_view, render
+from zsched_lab.demo.live_view import PlainLines, render
 from zsched_lab.fleet.view import FleetView, MapView, NodeView, TaskView
-from zsched_lab.maps.picture import FREE, WALL, MapPicture
 
 EDGES = ("edge1", "edge2", "edge3")
 ROBOTS = ("robot1", "robot2", "robot3")
@@ -72,54 +70,6 @@ def test_a_frame_fits_and_shows_the_story(width: int, height: int) -> None:
     assert "joint" in text
 
 
-def test_the_map_grows_in_it() -> None:
-    def shown(side: int) -> tuple[str, int]:
-        cells = np.zeros((80, 160), np.uint8)
-        cells[:side, :side] = FREE
-        cells[0, :side] = WALL
-        maps = (MapView(robot="robot1", maps=3, age_s=0.1, picture=MapPicture(cells=cells, known_m2=side)),)
-        text = "\n".join(drawn(a_view(maps=maps), 100, 30))
-        return text, sum("\u2800" <= letter <= "\u28ff" for letter in text)
-
-    (small, few), (large, many) = shown(20), shown(80)
-    assert "the merged map, 20 m²" in small
-    assert "the merged map, 80 m²" in large
-    assert 0 < few < many
-    assert "no map yet" in "\n".join(drawn(a_view(), 100, 30))
-
-
-def test_a_long_event_is_told_to_its_end() -> None:
-    event = "  23.4 s  map_merge moves edge1 -> edge2 (epoch 2): edge1 owes 0.31 s more than edge2"
-    lines = drawn(a_view(events=(*(f"event {index}" for index in range(9)), event)), 100, 30)
-
-    beside = " ".join(line[50:].strip("│ ") for line in lines)
-    assert event.strip() in beside
-
-
-def test_a_utility_that_is_absent_is_a_dash_not_a_number() -> None:
-    row = next(line for line in drawn(a_view(), 100, 30) if "│robot1 " in line and "0.82" in line)
-
-    assert row.split("0.82")[1].split()[0] == "-"
-
-
-def test_nothing_known_yet_is_drawn_too() -> None:
-    lines = drawn(a_view(task=None, maps=(), nodes=(), events=()), 80, 24)
-
-    assert any("waiting for the first answer" in line for line in lines)
-
-
-def test_problems_stand_before_the_events() -> None:
-    text = "\n".join(drawn(a_view(problems=("robot1: 1 of 3 electors lost their state",)), 100, 30))
-
-    assert "electors lost their state" in text
-    assert "event 49" in text
-
-
-def test_an_unmeasured_cpu_is_no_bar() -> None:
-    assert "█" not in cpu_bar(None, 8).plain
-    assert "█" in cpu_bar(0.5, 8).plain
-
-
 def test_plain_lines_show_events_at_once_and_progress_every_ten_seconds() -> None:
     stream = io.StringIO()
     with PlainLines(stream) as view:
@@ -131,9 +81,3 @@ def test_plain_lines_show_events_at_once_and_progress_every_ten_seconds() -> Non
     assert [line.split()[0] for line in lines] == ["0.0", "10.0", "20.0", "25.0"]
     assert "owner edge2" in lines[0]
     assert "edge1 -> edge2" in lines[-1]
-
-
-def test_no_terminal_means_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
-    del capsys
-    assert isinstance(make_view(headless=True), PlainLines)
-    assert isinstance(make_view(headless=False), PlainLines)

@@ -10,7 +10,7 @@ from zsched.tasks.map_merge.geometry import Pose2
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Cells, Grid
 from zsched_lab.explore.body import Limits, Twist
 from zsched_lab.explore.explorer import AVOID_M, AVOID_S, CLAIM_LIFE_S, Explorer, State, avoid_s
-from zsched_lab.explore.frontier import Claim, Frontier, choose, find_frontiers, utility
+from zsched_lab.explore.frontier import Claim, Frontier, choose, find_frontiers
 from zsched_lab.explore.planner import INFLATION_M, distances, plan_map, way_to
 
 SIDE = 0.05
@@ -112,19 +112,6 @@ def test_the_border_to_the_unknown_is_a_frontier_with_its_way_and_gain() -> None
         assert plan.drivable[one.cell]
 
 
-def test_the_edge_of_the_map_is_a_frontier_too() -> None:
-    """A merged map is cut to what is known: beyond its last row nobody has looked."""
-    plan = plan_map(grid_of(open_to_the_right()[:, :80]))
-    assert find_frontiers(plan, distances(plan, (1.0, 2.0)))
-
-
-def test_a_chink_in_a_wall_is_no_frontier() -> None:
-    data = room()
-    data[40:44, :2] = FREE  # 20 cm
-    plan = plan_map(grid_of(data))
-    assert find_frontiers(plan, distances(plan, (1.0, 2.0))) == []
-
-
 def test_what_lies_behind_a_wall_is_no_gain() -> None:
     data = np.full((80, 240), UNKNOWN, dtype=np.int8)
     data[:, :120] = room()
@@ -133,13 +120,6 @@ def test_what_lies_behind_a_wall_is_no_gain() -> None:
     found = find_frontiers(plan, distances(plan, (1.0, 2.0)))
     assert found
     assert max(one.gain_m2 for one in found) <= 0.75 * 0.9 + 0.1
-
-
-def test_unreachable_frontiers_do_not_count() -> None:
-    data = open_to_the_right()
-    data[:, 58:62] = OCCUPIED
-    plan = plan_map(grid_of(data))
-    assert find_frontiers(plan, distances(plan, (1.0, 2.0))) == []
 
 
 def frontier(x: float, way_m: float, gain_m2: float = 3.0) -> Frontier:
@@ -162,15 +142,6 @@ def test_a_claimed_goal_is_left_to_who_is_nearer() -> None:
     farther = Claim(robot="robot2", x=0.3, y=0.0, way_m=3.0)
     assert choose("robot1", [near, far], [closer], None, ()) is far
     assert choose("robot1", [near, far], [farther], None, ()) is near
-
-
-def test_of_two_that_are_equally_near_exactly_one_gives_way() -> None:
-    goal = frontier(0.0, 2.0)
-    free = utility("robot1", goal, (), None)
-    first = utility("robot1", goal, [Claim(robot="robot2", x=0.0, y=0.0, way_m=2.0)], None)
-    second = utility("robot2", goal, [Claim(robot="robot1", x=0.0, y=0.0, way_m=2.0)], None)
-    assert first == free
-    assert second < free
 
 
 # --- the explorer ----------------------------------------------------------------------------------------------------
@@ -225,16 +196,6 @@ def test_a_first_drive_is_driven_straight_and_then_it_chooses_by_itself() -> Non
     assert one.state is State.DRIVING
     assert one.claim is not None
     assert one.way[-1][0] > 2.0
-
-
-def test_a_wall_ends_a_first_drive() -> None:
-    one = Explorer("robot1", Limits(), first=(0.0, 90.0))
-    one.take_transform(Pose2())
-    one.take_map(grid_of(open_to_the_right()))
-    one.step(Pose2(x=1.0, y=2.0), 0.0)
-    assert one.claim is None
-    one.step(Pose2(x=1.0, y=2.0), 1.0, is_blocked=True)
-    assert one.claim is not None
 
 
 def test_a_wholly_known_map_leaves_it_idle() -> None:

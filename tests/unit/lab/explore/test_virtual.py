@@ -1,12 +1,7 @@
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
-import cv2
 import pytest
 
-from zsched_lab.explore.__main__ import main, paired_interval, table
 from zsched_lab.explore.agent import MAP_PERIOD_S, Agent, RobotSettings
 from zsched_lab.explore.virtual import VirtualResult, VirtualRun, run_virtual
 from zsched_lab.explore.world import World
@@ -109,33 +104,3 @@ def test_more_robots_are_faster_than_one() -> None:
     assert alone is not None
     assert three is not None
     assert three < 0.7 * alone
-
-
-def test_the_interval_holds_the_difference_and_shrinks_to_it() -> None:
-    low, high = paired_interval([12.0, 14.0, 13.0, 15.0], [10.0, 11.0, 10.0, 11.0])
-    assert 2.0 <= low < 3.25 < high <= 4.0
-    assert paired_interval([3.0, 4.0], [1.0, 2.0]) == (2.0, 2.0)
-
-
-def test_the_table_tells_means_and_differences() -> None:
-    lines = table({0.0: [10.0, 12.0], 5.0: [20.0, 22.0]})
-    assert "11.0 s" in lines[1]
-    assert "+10.0 s [+10.0, +10.0], +91%" in lines[2]
-
-
-def test_the_benchmark_prints_a_line_per_run_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    png = tmp_path / "explored.png"
-    arguments = ["--world", "turtlebot3", "--seeds", "1", "--delays", "0,2", "--json", "--png", str(png)]
-    assert main(arguments) == 0
-    runs = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [run["delay_s"] for run in runs] == [0.0, 2.0]
-    assert runs[0]["time_s"] < runs[1]["time_s"]
-    assert runs[0]["coverage"] >= 0.89
-    picture = cv2.imread(str(png))
-    assert picture is not None
-    assert picture.std() > 10.0
-
-
-def test_the_benchmark_names_a_world_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--world", "nowhere"]) == 78
-    assert "nowhere" in capsys.readouterr().err

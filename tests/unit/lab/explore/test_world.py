@@ -10,7 +10,7 @@ import pytest
 from zsched.core.values.errors import ConfigError
 from zsched.tasks.map_merge.grid import FREE, OCCUPIED
 from zsched_lab.explore.office import OfficeSize, office
-from zsched_lab.explore.world import START_CLEARANCE_M, START_SPACING_M, make_world, read_map_server, shipped
+from zsched_lab.explore.world import START_CLEARANCE_M, START_SPACING_M, read_map_server, shipped
 from zsched_lab.explore.worlds import load_world
 
 
@@ -73,15 +73,6 @@ def test_the_same_seed_builds_the_same_office_and_another_seed_another() -> None
     assert office(7, OfficeSize(length_m=20.0)).solid.shape[1] > one.solid.shape[1]
 
 
-def test_an_office_of_another_length_has_a_name_of_its_own_and_the_usual_one_keeps_its() -> None:
-    long = load_world("office:7:20")
-    assert np.array_equal(long.solid, office(7, OfficeSize(length_m=20.0)).solid)
-    assert (long.name, load_world("office:7:10").name) == ("office:7:20", "office:7")
-    for length in (5, 101):
-        with pytest.raises(ConfigError, match="6 to 100 m"):
-            load_world(f"office:7:{length}")
-
-
 def test_a_map_server_file_is_read_upright_and_unknown_is_solid(tmp_path: Path) -> None:
     image = np.full((20, 30), 254, dtype=np.uint8)
     image[0, :] = 0  # the upper side
@@ -111,16 +102,3 @@ def test_a_bad_map_server_file_is_refused_with_the_reason(tmp_path: Path, text: 
     image = np.full((5, 5), 254, dtype=np.uint8) if has_image else None
     with pytest.raises(ConfigError, match=why):
         read_map_server(write_map(tmp_path, text, image))
-
-
-@pytest.mark.parametrize("name", ["garden", "office:x", "office:-1", ""])
-def test_an_unknown_world_names_the_known_ones(name: str) -> None:
-    with pytest.raises(ConfigError, match="turtlebot3"):
-        load_world(name)
-
-
-def test_clearance_is_the_distance_to_the_next_wall() -> None:
-    world = make_world("box", np.zeros((40, 40), dtype=np.bool_), 0.05, (0.0, 0.0), (1.0, 1.0))
-    assert world.room_m(1.0, 1.0) == pytest.approx(1.0, abs=0.06)
-    assert world.room_m(0.125, 1.0) == pytest.approx(0.125, abs=0.01)
-    assert world.room_m(-0.01, 1.0) == 0.0

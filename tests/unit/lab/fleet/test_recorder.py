@@ -16,10 +16,6 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert read_records(tmp_path / "records" / "events.ndjson") == [{"kind": "move"}]
 
 
-def test_a_file_that_is_not_there_has_no_records(tmp_path: Path) -> None:
-    assert read_records(tmp_path / "none.ndjson") == []
-
-
 def test_follower_gives_each_whole_line_once_and_skips_damaged_ones(tmp_path: Path) -> None:
     path = tmp_path / "a.ndjson"
     follower = Follower(path)

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from zsched_lab.fleet.schedule import Injection, SchedulePolicy, make_schedule, push_schedule, random_schedule
+from zsched_lab.fleet.schedule import SchedulePolicy, make_schedule, push_schedule, random_schedule
 
 NODES = ("edge1", "edge2", "edge3")
 
@@ -37,17 +37,3 @@ def test_push_leaves_time_between_two_moves_in_the_default_run() -> None:
     assert len(windows) == 3
     assert all(window.target is None for window in windows)
     assert all(b.start_s - a.start_s >= 14.0 for a, b in itertools.pairwise(windows))
-
-
-def test_push_twice_even_in_a_short_run() -> None:
-    assert len(push_schedule(20.0, seed=1)) == 2
-
-
-def test_random_schedule_without_nodes_is_refused() -> None:
-    with pytest.raises(ValueError, match="nodes"):
-        random_schedule(60.0, 1, ())
-
-
-def test_a_window_that_ends_before_it_starts_is_refused() -> None:
-    with pytest.raises(ValueError, match="end_s"):
-        Injection(start_s=5.0, end_s=4.0, target=None)

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from zsched_lab.fleet.view import Move, merge_moves, node_views, past_allocations, problems, task_view
+from zsched_lab.fleet.view import Move, merge_moves, node_views, past_allocations, task_view
 
 KINDS = {"edge1": "edge", "edge2": "edge", "robot1": "robot"}
 
@@ -58,22 +58,6 @@ def test_the_task_is_read() -> None:
     assert task.votes == (("robot1", "edge1"),)
 
 
-def test_mappings_may_come_as_lists_of_pairs() -> None:
-    status = a_status()
-    status["tasks"][0]["decision"] = {
-        "aggregates": [["edge1", 0.6]],
-        "utilities": [["robot1", [{"candidate": "edge1", "value": 0.5}, {"candidate": "edge2", "value": None}]]],
-    }
-    status["tasks"][0]["vote"] = None
-
-    task = task_view(status, "map_merge")
-
-    assert task is not None
-    assert task.aggregates == (("edge1", 0.6),)
-    assert task.utilities == (("robot1", (("edge1", 0.5),)),)
-    assert task.votes == ()
-
-
 @pytest.mark.parametrize("status", [{}, {"tasks": None}, {"tasks": [{"name": "other"}]}])
 def test_a_task_that_is_not_there_is_none(status: dict[str, Any]) -> None:
     assert task_view(status, "map_merge") is None
@@ -88,10 +72,6 @@ def test_robots_come_first_and_a_silent_node_is_shown_by_a_peers_word() -> None:
     assert (edge1.state, edge1.cpu_ratio, edge1.memory_ratio) == ("no answer", 0.9, None)
     assert (edge1.link, edge1.worker, edge1.is_owner, edge1.is_loaded) == ("-70 dBm", "ready", True, True)
     assert (edge2.state, edge2.cpu_ratio) == ("no answer", None)
-
-
-def test_each_problem_is_told_once() -> None:
-    assert problems({"robot1": a_status(), "robot2": a_status()}) == ("robot1: no quorum",)
 
 
 def test_history_is_put_on_the_listeners_clock() -> None:

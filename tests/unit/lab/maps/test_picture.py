@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zsched.tasks.map_merge.grid import Grid
-from zsched_lab.maps.picture import FREE, SIDE, UNKNOWN, WALL, MapPicture
+from zsched_lab.maps.picture import FREE, WALL, MapPicture
 
 
 def a_map(height: int, width: int) -> Grid:
@@ -24,20 +24,3 @@ def test_a_picture_is_the_known_part_and_comes_back_from_its_record() -> None:
     assert picture.known_m2 == pytest.approx(15 * 0.05**2)
     again = MapPicture.read(json.loads(json.dumps(picture.record())))
     assert again.cells.tolist() == picture.cells.tolist()
-
-
-def test_a_large_map_keeps_its_thin_walls() -> None:
-    picture = MapPicture.of(a_map(700, 1001))
-
-    height, width = picture.cells.shape
-    assert (width <= SIDE, height) == (True, -(-700 // -(-1001 // SIDE)))
-    assert set(picture.cells[0].tolist()) == {WALL}
-    assert set(picture.cells[1:].ravel().tolist()) == {FREE}
-
-
-def test_what_nobody_has_seen_is_no_picture() -> None:
-    grid = Grid(data=np.full((4, 4), -1, np.int8), resolution=0.1)
-
-    assert MapPicture.of(grid).cells.size == 0
-    assert MapPicture.read(MapPicture.of(grid).record()).cells.size == 0
-    assert UNKNOWN == 0

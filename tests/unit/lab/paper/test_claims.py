@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,31 +13,13 @@ from zsched_lab.paper.claims import (
     better_than_ours,
     difference,
     judged,
-    over,
     relative,
     shared,
     table_of,
     verdict,
 )
-from zsched_lab.paper.figures import save_all, save_gains, save_panels, save_radio
-from zsched_lab.paper.remarks import ended_text, losses_text
-from zsched_lab.paper.report import (
-    blocks_parts,
-    claims_text,
-    gains_parts,
-    groups_of,
-    in_block,
-    is_whole,
-    judged_groups,
-    main_runs,
-    memory_text,
-    others_text,
-    radio_text,
-    report,
-)
 from zsched_lab.paper.schemes import FIXED_SCHEMES, PAPER_SCHEMES, SCHEMES
 
-EVALUATION = Path(__file__).parents[4] / "docs" / "evaluation"
 HIGHER = Claim(source="paper", says="x", metric="map_hz", mine=("a",), theirs=("b",), target=0.2)
 LOWER = Claim(source="paper", says="x", metric="task_latency_s", mine=("a",), theirs=("b",), target=-0.28)
 FIGURES = {
@@ -161,169 +141,3 @@ def test_claims_are_judged_by_the_schemes_they_speak_of() -> None:
     assert {metric for _, metric, _ in better_than_ours(runs)} == {"throughput_mb_s"}
     assert {scheme for scheme, _, _ in better_than_ours(runs)} == set(PAPER_SCHEMES)
     assert all(set(claim.mine) | set(claim.theirs) <= set(SCHEMES) for claim in CLAIMS)
-
-
-def test_whether_memory_was_exhausted_is_judged_too() -> None:
-    def with_peak(scheme: str, peak: float) -> dict[str, Any]:
-        return a_run(scheme, 0, nodes={"edge1": {"memory_peak": peak}})
-
-    both = [with_peak("fixed_e1", 0.5), with_peak("dyna_cpu", 0.6)]
-    assert "variants 0.60, fixed 0.50. **reproduced** (but so it is under fixed placement)." in memory_text(both)
-    assert memory_text([with_peak("fixed_e1", 0.97), with_peak("dyna_cpu", 0.6)]).endswith("**reproduced**.\n")
-    assert memory_text([with_peak("dyna_mem", 0.96)]).endswith("**not reproduced**.\n")
-    assert memory_text([]) == ""
-
-
-def test_each_table_says_how_far_a_scheme_is_from_the_fixed_ones() -> None:
-    runs = [a_run(name, run, map_hz=4.0 + run / 10) for name in FIXED_SCHEMES for run in range(3)]
-    runs += [a_run("zsched", run, map_hz=5.0 + run / 8) for run in range(3)]
-    runs += [a_run("random", run, map_hz=2.0) for run in range(2)]
-
-    assert over(runs, "zsched")["map_hz"].value == pytest.approx(0.25)
-    assert over(runs, "random") == {}, "two runs say nothing"
-    text = "\n".join(gains_parts({"scenario": {"level": "one"}, "runs": runs}, ["gains.png"]))
-    assert "| where | scheme | runs | MB/s | maps/s | task s | p95 s |" in text
-    assert "+25 % [+25, +25]" in text
-    assert "| matrix (one) | 3 |" in text, "against the best one"
-    assert "![gains.png](gains.png)" in text
-    assert "random" not in text
-    assert others_text(runs) == "", "zsched is in the table of gains, and two runs of random say nothing"
-    runs += [a_run("random", 2, map_hz=2.0)]
-    assert "| random | 3 |" in others_text(runs)
-
-
-def test_what_was_dropped_stands_beside_what_was_lost_by_reason() -> None:
-    runs = [a_run("zsched", 0, lost=1, dropped=4, drops={"cut": 3, "overflow": 1})]
-    runs += [a_run("zsched", 1, lost=0, dropped=6, drops={"cut": 6}), a_run("fixed_e1", 0, lost=0, dropped=0, drops={})]
-    runs += [a_run("dyna_both", 0, lost=2, dropped=3)]  # of before reasons were kept
-    text = losses_text({"matrix (one)": runs})
-
-    assert "| matrix (one) | zsched | 2 | 4 | 1 | cut 9, overflow 1 |" in text
-    assert "| matrix (one) | dyna_both | 1 | 2 | 2 | reason not kept 3 |" in text
-    assert "fixed_e1" not in text
-    assert losses_text({"matrix (one)": runs[2:3]}).endswith("\n\nNothing was lost or dropped.\n")
-    results = json.loads((EVALUATION / "results.json").read_text(encoding="utf-8"))
-    assert losses_text(groups_of(results)) in report(results, [])
-
-
-@pytest.mark.parametrize(
-    ("file", "told"),
-    [
-        ("results.json", "run 3 of fixed_e2 (19.6 s; *done* is 1.00)"),
-        ("heavy-again.json", "run 7 of fixed_e2 (35.4 s; *done* is 0.88)"),
-    ],
-)
-def test_a_run_that_ended_because_it_was_done_is_named_where_it_counts_as_not_done(file: str, told: str) -> None:
-    results = json.loads((EVALUATION / file).read_text(encoding="utf-8"))
-    runs = main_runs(results)
-    said = ended_text(runs, results["scenario"])
-
-    assert said.endswith(f": {told}.\n")
-    longest = [{**one, "duration_s": results["scenario"]["duration_s"]} for one in runs]
-    assert ended_text(longest, results["scenario"]) == "", "of those whose time was over nothing is known"
-
-
-def a_block(name: str, schemes: tuple[str, ...], runs: int = 3) -> list[dict[str, Any]]:
-    """Runs of a block in which zsched makes half as many maps again as the fixed schemes."""
-    return [
-        a_run(scheme, run, "four", block=name, map_hz=(6.0 if scheme == "zsched" else 4.0) + run / 10)
-        for scheme in schemes
-        for run in range(runs)
-    ]
-
-
-def test_the_report_says_where_placing_pays_and_judges_a_block_that_is_a_whole_matrix(tmp_path: Any) -> None:
-    every = (*FIXED_SCHEMES, *PAPER_SCHEMES, "zsched")
-    runs = a_block("heavy", every) + a_block("part", (*FIXED_SCHEMES, "zsched")) + a_block("thin", every, runs=2)
-    results = {"scenario": {"level": "one", "blocks": {"heavy": {}, "part": {}, "thin": {}, "gone": {}}}, "runs": runs}
-
-    text = "\n".join(gains_parts(results))
-    assert "| heavy | zsched | 3 |" in text
-    assert "+49 % [" in text
-    assert "| part | zsched | 3 |" in text
-    assert "matrix" not in text, "it was not run"
-    assert "oracle |" not in text
-    assert "thin" not in text, "two runs say nothing"
-    assert gains_parts({**results, "runs": []}) == []
-
-    assert is_whole(in_block(runs, "heavy"))
-    assert not is_whole(in_block(runs, "part"))
-    assert not is_whole(in_block(runs, "thin"))
-    blocks: dict[str, Any] = {"heavy": {}, "part": {}}
-    told = {"scenario": {"level": "one", "blocks": blocks, "merge": {}}, "runs": runs}
-    shown = "\n".join(blocks_parts(told, ["heavy.png"]))
-    assert "## Block heavy" in shown
-    assert "![heavy.png](heavy.png)" in shown
-    assert "## Block part" not in shown
-    assert "| part | zsched | 3 |" in shown
-    assert "| heavy | verdict |" in claims_text(judged_groups(told))
-    assert "| part | verdict |" not in claims_text(judged_groups(told))
-    row = next(line for line in claims_text(judged_groups(told)).splitlines() if "at least +20 % over fixed" in line)
-    assert row.endswith("| - | **not measured** | +49 % [+46, +52] | **exceeded** |")
-
-    groups = groups_of(results)
-    assert save_gains(tmp_path / "gains.png", groups, "title") == "gains.png"
-    assert save_panels(tmp_path / "heavy.png", groups["heavy"], "title") == "heavy.png"
-    assert save_gains(tmp_path / "none.png", {"thin": groups["thin"]}, "title") is None
-    assert {path.name for path in tmp_path.iterdir()} == {"gains.png", "heavy.png"}
-
-
-def test_the_report_holds_every_claim_scheme_level_and_picture(tmp_path: Any) -> None:
-    runs = [a_run(name, run) for name in ("fixed_e1", "zsched") for run in range(3)]
-    runs += [a_run("random", 0)]
-    runs += [a_run(name, 0, block="narrow", map_hz=7.5) for name in ("fixed_e1", "zsched")]
-    runs += [a_run("zsched", 1, block="narrow", map_hz=99.0)]  # in another world than fixed_e1's
-    runs += [a_run(name, 0, level="two", map_hz=2.5) for name in ("fixed_e1", "zsched")]
-    node = {"cpu_cores": 0.3, "memory_mb": 512.0, "ballast_mb": 0.0}
-    levels = {name: {"streams": 1, "share": 0.6, "side": 640} for name in ("one", "two")}
-    scenario = {
-        "name": "paper", "seed": 1, "level": "one", "levels": levels, "nodes": {"edge1": node},
-        "merge": {"mode": "track", "rate_hz": 4.0, "resolution_m": 0.05}, "target_coverage": 0.8, "pressure_limit": 0.2,
-        "blocks": {
-            "narrow": {"world": None, "links": {"bandwidth_mbit": 9.8}},
-            "gone": {"world": "turtlebot3", "links": {"bandwidth_mbit": None}},
-        },
-    }  # fmt: skip
-    invalid = [{"cell": "one-zsched-1", "reason": "pressure 0.50\nmore"}]
-    row = {"moves": 3, "wasted_moves": 0, "mean_dbm": -55.0, "under_best_db": 1.2, "below_70_ratio": 0.0}
-    radio = {
-        "links": "simulated", "duration_s": 60.0, "best_dbm": -53.8, "best_fixed_dbm": -57.0,
-        "picture": "radio.png", "schemes": {"zsched": row},
-    }  # fmt: skip
-    results = {
-        "scenario": scenario, "runs": runs, "invalid": invalid, "command": "zsched bench paper", "input": "log x",
-        "version": "1", "machine": "2 cores", "radio": radio,
-        "missing": ["one-random-3"], "skipped": {"gone": "no exploring robots"},
-    }  # fmt: skip
-    pictures = save_all(runs, "one", ("one", "two"), tmp_path, "title")
-    pictures.append(
-        save_radio(
-            tmp_path / "radio.png", {"robot1": [(0.0, -50.0), (5.0, -60.0)]}, {"zsched": [(0.0, "robot1")]}, 60.0
-        )
-    )
-
-    text = report(results, pictures)
-
-    assert all(claim.says in text for claim in CLAIMS)
-    assert "| zsched | 3 | 2.00 |" in text  # the matrix's, without the block's
-    assert "| zsched | 1 | 7.50 |" in text
-    assert "Where the numbers of runs differ, so do the worlds" in text
-    assert "| narrow | zsched | 1 | 7.50 |" in text
-    assert "every node sends at most 9.8 Mbit/s" in text
-    assert "Left out: no exploring robots." in text
-    assert "No valid run of 1 cells: one-random-3." in text
-    assert "in any run: zsched 0.60, fixed 0.60." in text
-    assert "plain SSIM" not in text, "results.json has it"
-    assert "| maps/s | zsched | 2.00 | 2.50 |" in text
-    assert "one-zsched-1: pressure 0.50" in text
-    assert "-55.0" in text
-    assert "strongest signal, says the paper: zsched: **reproduced**" in text
-    lost = {**radio, "schemes": {"dyna_net": row | {"under_best_db": 1.6}, "zsched": row | {"mean_dbm": -57.5}}}
-    assert radio_text(lost).count("**not reproduced**") == 2
-    assert {"cpu.png", "memory.png", "throughput.png", "frequency.png", "latency.png", "ssim.png", "sweep.png"} <= set(
-        pictures
-    )
-    for name in pictures:
-        assert name in text
-        assert (tmp_path / name).stat().st_size > 5000
-    assert save_all([], "one", (), tmp_path, "title") == []

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from zsched_lab.paper.leaving import left_after_s, main, told
+from zsched_lab.paper.leaving import left_after_s, told
 from zsched_lab.paper.load import schedule
 from zsched_lab.paper.scenario import LoadPlan
 
@@ -35,12 +35,3 @@ def test_a_move_counts_when_the_edge_that_it_leaves_is_loaded() -> None:
     late = run_of([[0.0, first.node], [at + 4.0, other]])
     (line,) = told(SCENARIO, [late, run_of([[0.0, first.node], [at + 1.0, other]])])
     assert line.split(maxsplit=1) == ["zsched", "1.0 to 4.0 s, median 2.5; 1 of 2 moves within 3 s"]
-
-
-def test_the_times_of_a_published_record_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(RESULTS)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(maxsplit=1) for line in lines[1:]] == [
-        ["dyna_both", "0.8 to 1.6 s, median 1.2; 11 of 11 moves within 3 s"],
-        ["zsched", "1.3 to 3.7 s, median 2.1; 10 of 12 moves within 3 s"],
-    ]

@@ -18,10 +18,8 @@ from zsched_lab.paper.matrix import (
     GIVE_UP,
     METRICS,
     Matrix,
-    Progress,
     collect,
     invalid_reason,
-    set_aside,
     undone,
 )
 from zsched_lab.paper.places import robots_scenario_path, scenario_path
@@ -112,25 +110,6 @@ def test_a_block_that_cannot_be_run_here_is_left_out_with_its_reason(scenario: S
     blocks = {name: replace(block, links=LinkLimits()) for name, block in scenario.blocks.items()}
     assert without(replace(scenario, blocks=blocks), is_exploring=True, why_not=why_not) == {}
     assert len(asked) == 1  # namespaces are tried only for who wants them
-
-
-def test_the_plan_tells_blocks_runs_and_time_by_hand(scenario: Scenario) -> None:
-    blocks = {name: scenario.blocks[name] for name in ("turtlebot3", "narrow")}
-    schemes = ("zsched", "fixed_e1")
-    scenario = replace(scenario, duration_s=42.0, runs=2, schemes=schemes, sweep=Sweep(), blocks=blocks)
-    cells = cells_of(scenario, ("zsched", "fixed_e1"))
-
-    text = plan_text(scenario, cells, cells[1:], 120.0, {"gone": "no namespaces"}, None)
-    rows = {line.split("  ")[0].strip(): line for line in text.splitlines()}
-
-    assert AROUND_S == 18.0
-    assert "  4    4 min  2 schemes, load one, office:20260 to office:20261" in rows["matrix (one)"]
-    assert "  4    4 min  2 schemes, load one, turtlebot3" in rows["turtlebot3"]
-    assert "  4    4 min" in rows["narrow"]  # 4 x (60 + 4) s = 256 s
-    assert "links of 9.8 Mbit/s" in rows["narrow"]
-    assert rows["gone"].endswith("left out: no namespaces")
-    # 11 cells of 60 s are left, four of them take 4 s more, and 120 s of radio: 796 s.
-    assert "12 runs, 1 of them done already; at most 13 min" in text
 
 
 def test_a_plan_starts_nothing_and_makes_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,21 +238,6 @@ def test_figures_by_older_definitions_are_made_again_without_a_run(scenario: Sce
     assert [line for line in said if "definitions" in line] == [
         "[1/1] one-zsched-1: figures by the present definitions"
     ]
-
-
-def test_progress_tells_the_time_that_is_left(scenario: Scenario) -> None:
-    cell = cells_of(scenario, ("zsched",), runs=1)[0]
-    progress = Progress(total=4, done=1, took_s=[50.0])
-
-    assert progress.line(cell) == "[2/4, about 2 min left] one-zsched-1"
-
-
-def test_folders_set_aside_get_new_names(tmp_path: Path) -> None:
-    for _ in range(2):
-        (tmp_path / "run").mkdir()
-        set_aside(tmp_path / "run", "invalid")
-
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.invalid-1", "run.invalid-2"]
 
 
 # --- the bench's own ------------------------------------------------------------------------------------------------

@@ -17,23 +17,15 @@ from zsched.tasks.map_merge.grid import FREE, OCCUPIED, UNKNOWN, Grid
 from zsched_lab.fleet.recorder import Recorder
 from zsched_lab.paper.arrivals import Arrival
 from zsched_lab.paper.drive_clock import begun_before, smoothed
-from zsched_lab.paper.load import Window
 from zsched_lab.paper.metrics import (
     WALL_M,
     WORLD,
     Truth,
     brief,
-    held_instants,
     measure,
     messages,
-    over_nodes,
-    owned_s,
-    owner_at,
     owners_within,
-    percentile,
-    reached_s,
     served_s,
-    wasted,
 )
 from zsched_lab.paper.places import scenario_path
 from zsched_lab.paper.radio_bench import radio_figures
@@ -330,19 +322,6 @@ def test_an_exploring_robots_own_word_ends_the_task(tmp_path: Path, scenario: Sc
 
     assert figures["is_done"]
     assert figures["task_latency_s"] == pytest.approx(6.75)
-
-
-def test_small_figures() -> None:
-    assert percentile([], 0.5) is None
-    assert percentile([1.0, 2.0, 3.0], 0.95) == 3.0
-    assert held_instants(12.0) == [5.0, 10.0, 12.0]
-    assert held_instants(10.0) == [5.0, 10.0]
-    assert reached_s([], 0.5) is None
-    assert owner_at([(1.0, "a")], 0.5) is None
-    assert owned_s([(1.0, "a"), (3.0, "b"), (99.0, "a")], "a", 10.0) == 2.0
-    assert over_nodes({})["cpu_peak"] is None
-    assert wasted([(0.0, "a"), (10.0, "b"), (45.0, "a")]) == 0
-    assert Window(node="a", start_s=0.0, end_s=1.0).node == "a"
 
 
 def test_the_radios_figures(tmp_path: Path) -> None:

@@ -11,24 +11,13 @@ import pytest
 
 from zsched.config.load import load_fleet
 from zsched.core.values.errors import ConfigError
-from zsched_lab.explore.navigate import main as navigate
 from zsched_lab.explore.robot import parse as parse_explorer
-from zsched_lab.explore.slam import main as slam
-from zsched_lab.explore.slam_worker import main as slam_worker
 from zsched_lab.paper.arrivals import Arrival, Streams
 from zsched_lab.paper.bench import BenchOptions, InputsOf, planned
 from zsched_lab.paper.cells import Cell, cells_of
 from zsched_lab.paper.claims import (
-    GAINS,
-    SIX,
-    best_fixed,
-    better_than_ours,
-    compared,
     declared,
-    over,
-    over_best_fixed,
 )
-from zsched_lab.paper.coverage_report import coverage_parts, coverage_table, roles_table, save_coverage, stood_text
 from zsched_lab.paper.led_metrics import (
     coverage_figures,
     led_of,
@@ -43,13 +32,6 @@ from zsched_lab.paper.places import robots_scenario_path, scenario_path, shipped
 from zsched_lab.paper.plan import AROUND_S, cell_s, plan_text
 from zsched_lab.paper.remarks import declared_parts
 from zsched_lab.paper.report import (
-    EACH_SAY,
-    MOVING_SAY,
-    better_text,
-    blocks_parts,
-    gains_parts,
-    gains_text,
-    main_runs,
     report,
 )
 from zsched_lab.paper.robots import ODOMETRY, ExploreRobots, Place, slam_task
@@ -145,15 +127,6 @@ def test_every_second_run_takes_the_schemes_in_reverse() -> None:
     order = [[cell.scheme.name for cell in cells_of(scenario, ()) if cell.run == run] for run in range(3)]
     assert order[0] == order[2] == order[1][::-1]
     assert abs(order[0].index("zsched") - order[0].index("dyna_both")) == 1
-
-
-def test_heavy_with_all_schemes_is_heavy() -> None:
-    paper, again = load_scenario(scenario_path()), shipped("heavy-all")
-    heavy = paper.blocks["heavy"]
-    assert again.merge == replace(paper.merge, **heavy.merge)
-    assert again.explore == replace(paper.explore, world=heavy.world or "")
-    assert (again.nodes, again.load, again.links) == (paper.nodes, paper.load, paper.links)
-    assert again.levels[again.level] == paper.levels[heavy.level or ""]
 
 
 def test_quick_runs_the_first_block_of_the_readme(tmp_path: Path) -> None:
@@ -261,25 +234,6 @@ def test_nano_s_robots_are_led_by_slam_and_navigation_on_their_edges(tmp_path: P
     assert not robots.ends_when_covered
 
 
-def test_nano_again_is_nano_whose_robots_first_drive_is_given(tmp_path: Path) -> None:
-    nano, again = shipped("nano"), shipped("nano-again")
-    assert again.explore == replace(nano.explore, first=dict.fromkeys(("robot1", "robot2", "robot3"), (3, 0)))
-    assert (again.merge, again.load) == (nano.merge, nano.load)
-    assert {share.cpu_cores for share in again.nodes.values()} == {shipped("nano-moves").full_cores}
-    assert (again.level, again.levels, again.links) == (nano.level, nano.levels, nano.links)
-    endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
-
-    robots = the_robots("nano-again", tmp_path)
-    commands = [command for _, command in robots.helpers(endpoints)]
-
-    led = {command[command.index("--robot") + 1]: command for command in commands if "--first" in command}
-    assert {command[2] for command in led.values()} == {"zsched_lab.explore.navigate"}
-    for robot, start in zip(("robot1", "robot2", "robot3"), robots.frames(3, 1), strict=True):
-        at = led[robot].index("--first")
-        x, y = start.apply_point(float(led[robot][at + 1]), float(led[robot][at + 2]))
-        assert [x, y] == pytest.approx([start.x + 3.0, start.y], abs=0.01)
-
-
 def test_slam_that_is_a_task_is_not_started_beside(tmp_path: Path) -> None:
     robots = the_robots("nano-moves", tmp_path)
     endpoints = {f"edge{number}": f"tcp/127.0.0.1:{number}" for number in (1, 2, 3)}
@@ -313,26 +267,6 @@ def test_a_scheme_moves_slam_only_where_it_says_so(
     assert "0.5" in tasks["map_merge"].worker.command
     is_papers = scheme.startswith("dyna")
     assert (tasks["slam_robot1"].tuning.score.value == "paper") == is_papers
-
-
-def test_the_matrix_s_schemes_leave_slam_alone() -> None:
-    scenario = load_scenario(scenario_path())
-    assert not any(cell.scheme.moves_slam for cell in cells_of(scenario, ()))
-
-
-@pytest.mark.parametrize(
-    ("main", "arguments"),
-    [
-        (navigate, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--cores", "-1"]),
-        (navigate, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--first", "1", "nan"]),
-        (slam, ["--robot", "r", "--endpoint", "tcp/127.0.0.1:1", "--match", "99"]),
-        (slam_worker, ["--robot", "r", "--map-period", "0"]),
-    ],
-)
-def test_wrong_options_of_the_programs_are_usage(main: Any, arguments: list[str]) -> None:
-    with pytest.raises(SystemExit) as told:
-        main(arguments)
-    assert told.value.code == 2
 
 
 def test_a_robot_is_led_only_by_a_node(tmp_path: Path) -> None:
@@ -485,46 +419,6 @@ def test_how_long_robots_stood_is_told_by_what_was_on_the_edge_of_their_slam(tmp
     assert stood_figures(tmp_path, run, {}, owner) == {}
 
 
-def test_a_block_whose_robots_stand_beside_the_model_alone_is_not_what_it_is_to_be() -> None:
-    """Under schemes that move a robot may stand there for what the merger has left behind: that tells nothing."""
-
-    def stood(model: float, both: float) -> str:
-        states = {"model": {"s": 60.0, "stood": model}, "both": {"s": 120.0, "stood": both}}
-        moving = {"model": {"s": 600.0, "stood": 0.5}}
-        return stood_text(
-            [a_run("fixed_e1", 0, 0.5, stood_by_state=states), a_run("zsched", 0, 0.5, stood_by_state=moving)]
-        )
-
-    assert "as it must be" in stood(0.01, 0.2)
-    assert "| and both: the tipping point | 2.0 | 20.0 % | - | - |" in stood(0.01, 0.2)
-    assert "| and the model | 1.0 | 1.0 % | 10.0 | 50.0 % |" in stood(0.01, 0.2)
-    for model, both in ((0.06, 0.2), (0.0, 0.04)):
-        assert "**not what the block is to show**" in stood(model, both)
-    assert "Not measured" in stood_text([a_run("zsched", 0, 0.5)])
-
-
-def test_a_block_without_fixed_schemes_is_judged_where_slam_stays() -> None:
-    def stood(model: float) -> str:
-        states = {"idle": {"s": 60.0, "stood": 0.0}, "model": {"s": 60.0, "stood": model}}
-        moved = {"idle": {"s": 120.0, "stood": 0.25}, "model": {"s": 30.0, "stood": 0.9}}
-        return stood_text(
-            [a_run("zsched", 0, 0.5, stood_by_state=states), a_run("zsched_slam", 0, 0.5, stood_by_state=moved)]
-        )
-
-    head = "| on the edge of its SLAM | moving: robots' minutes | stood | SLAM moves, too: robots' minutes | stood |"
-    assert head in stood(0.01)
-    assert "| and the model | 1.0 | 1.0 % | 0.5 | 90.0 % |" in stood(0.01)
-    assert "Where SLAM stays less than 5 % beside the model alone: as it must be." in stood(0.04)
-    assert "**not what the block is to show**" in stood(0.06)
-    only_moved = stood_text([a_run("zsched_slam", 0, 0.5, stood_by_state={"model": {"s": 9.0, "stood": 0.9}})])
-    assert "must be" not in only_moved
-    assert "not what" not in only_moved
-    parts = "\n".join(coverage_parts([a_run("zsched", 0, 0.5), a_run("zsched_slam", 0, 0.5)]))
-    assert parts.count("| on the edge | ") == 2, "whose CPU an edge's was is told apart, too"
-    assert parts.index("Where SLAM moves, too") > parts.index("| on the edge | ")
-    assert "### When robots stood" in "\n".join(coverage_parts(the_runs()))
-
-
 def a_run(scheme: str, run: int, covered: float, **changed: Any) -> dict[str, Any]:
     curve = [[5.0 * n, round(covered * n / 12, 4)] for n in range(13)]
     figures = {"scheme": scheme, "block": "nano", "level": "one", "run": run, "coverage_curve": curve}
@@ -538,36 +432,6 @@ def a_run(scheme: str, run: int, covered: float, **changed: Any) -> dict[str, An
 def the_runs(count: int = 3) -> list[dict[str, Any]]:
     base = {"fixed_e1": 0.5, "fixed_e2": 0.6, "fixed_e3": 0.4, "dyna_both": 0.7, "zsched": 0.65}
     return [a_run(name, run, value + 0.01 * run) for name, value in base.items() for run in range(count)]
-
-
-def test_the_best_fixed_scheme_stands_beside_the_mean_of_all() -> None:
-    runs = the_runs()
-    mean, best = over(runs, "zsched")["coverage_mean"], over_best_fixed(runs, "zsched")["coverage_mean"]
-
-    assert best_fixed(runs, "coverage_mean") == "fixed_e2"
-    assert mean.value == pytest.approx(0.66 / 0.51 - 1)
-    assert best.value == pytest.approx(0.66 / 0.61 - 1)
-    assert best_fixed([{**one, "stopped_ratio": one["coverage_mean"]} for one in runs], "stopped_ratio") == "fixed_e3"
-    assert best_fixed([one for one in runs if one["scheme"] != "fixed_e1"], "coverage_mean") is None
-    text = "\n".join(gains_parts(results_of(runs)))
-    assert "| where | scheme | runs | covered on the way | maps/s |" in text
-    assert f"| nano | zsched | 3 | {mean.text()} |" in text
-    assert f"| nano | 3 | {best.text()} |" in text, "against the best one"
-    assert GAINS[0] == "coverage_mean"
-    assert {"received_mb_s", "throughput_mb_s"} <= set(GAINS)
-
-
-def test_where_not_all_fixed_schemes_were_run_each_stands_alone() -> None:
-    runs = [one for one in the_runs(5) if one["scheme"] not in ("fixed_e2", "fixed_e3")]
-    told = dict(declared(runs))
-    assert list(told) == ["fixed_e1", "dyna_both"]
-    assert told["fixed_e1"].value == pytest.approx(0.67 / 0.52 - 1)
-    text = "\n".join(gains_parts(results_of(runs)))
-    assert EACH_SAY in text
-    assert "| nano | fixed_e1 | 5 | +" in text
-    whole = "\n".join(gains_parts(results_of(the_runs(5))))
-    assert MOVING_SAY in whole
-    assert "| nano | fixed_e1 |" not in whole
 
 
 def test_what_was_declared_of_led_robots_is_printed_and_has_a_verdict_when_all_runs_are_done() -> None:
@@ -601,50 +465,6 @@ def test_what_was_declared_of_led_robots_is_printed_and_has_a_verdict_when_all_r
     assert declared_parts({"nano": []}, results["scenario"]) == []
 
 
-def test_of_led_robots_no_scheme_of_the_paper_is_to_cover_more_or_stand_less() -> None:
-    runs = the_runs()
-    assert set(compared(runs)) - set(SIX) == {"coverage_mean", "walls_mean", "stopped_ratio"}
-    assert compared([{**one, "stopped_ratio": None} for one in runs]) == SIX
-    stood = [{**one, "stopped_ratio": 0.1 if one["scheme"] == "fixed_e3" else 0.2 + 0.01 * one["run"]} for one in runs]
-    better = {(scheme, metric) for scheme, metric, _ in better_than_ours(stood)}
-    assert ("dyna_both", "coverage_mean") in better
-    assert ("fixed_e3", "stopped_ratio") in better, "it is less that is better"
-    assert not {metric for scheme, metric in better if scheme == "fixed_e1"} & {"coverage_mean", "stopped_ratio"}
-    assert "dyna_both covered on the way +" in report(results_of(stood), [])
-    never = [{**one, "stopped_ratio": 0.03 * (one["run"] == 0 and one["scheme"] == "zsched")} for one in runs]
-    assert not [name for _, name, _ in better_than_ours(never) if name == "stopped_ratio"], (
-        "one run of three says little"
-    )
-    assert "fixed_e3 stood -11 % [" in better_text({"nano": stood})
-    assert "] of the time" in better_text({"nano": stood})
-    alike = [{**one, "coverage_mean": 0.5, "map_hz": 1.0} for one in runs]
-    assert "none of the nine metrics" in better_text({"nano": alike})
-
-
-def test_coverage_is_told_with_intervals_and_without_one_of_one_run() -> None:
-    told = coverage_table(the_runs())
-    row = next(line for line in told.splitlines() if line.startswith("| zsched"))
-    assert "0.330 ±0.012" in row  # 0.325, 0.330, 0.335: t(2) * 0.005 / sqrt(3)
-    one = coverage_table(the_runs(1))
-    assert "(n = 1)" in one
-    assert "inf" not in one + told
-    nobody_led = [{**figures, "stopped_ratio": None} for figures in the_runs()]
-    assert [part for part in coverage_parts(nobody_led) if part.startswith("#")] == ["### Coverage over time\n"]
-    assert "stood" not in "".join(coverage_parts(nobody_led))
-    assert coverage_parts([{**figures, "coverage_curve": None} for figures in nobody_led]) == []
-    short = [{**figures, "coverage_curve": [[0.0, 0.1], [5.0, 0.2]]} for figures in the_runs()]
-    assert "| runs | 0 s | 5 s | mean over the run |" in coverage_table(short), "no instant stands twice"
-    assert "| and both: the tipping point | 31.0 % | 0.0 % | 0.0 % | 58.0 % | 89.0 % | 9.0 % |" in roles_table(
-        the_runs()
-    )
-
-
-def test_the_curves_are_drawn_where_there_are_any(tmp_path: Path) -> None:
-    assert save_coverage(tmp_path / "c.png", the_runs(), "title") == "c.png"
-    assert (tmp_path / "c.png").stat().st_size > 5000
-    assert save_coverage(tmp_path / "d.png", [{**one, "coverage_curve": None} for one in the_runs()], "x") is None
-
-
 def results_of(runs: list[dict[str, Any]], main: str = "nano") -> dict[str, Any]:
     scenario = {
         "name": "nano",
@@ -663,35 +483,3 @@ def results_of(runs: list[dict[str, Any]], main: str = "nano") -> dict[str, Any]
         "version": "0",
         "machine": "x",
     }
-
-
-def test_a_report_is_of_the_main_block() -> None:
-    results = results_of(the_runs())
-    text = report(results, ["nano-coverage.png"])
-    assert len(main_runs(results)) == 15
-    assert "### Coverage over time" in text
-    assert "Warm-up before the drive: 60 s" in text
-    assert "* Program: not kept: " in text, "of runs of before it was kept"
-    assert "* Machine: not kept: " in text
-    assert "![nano-coverage.png](nano-coverage.png)" in text
-    assert blocks_parts(results) == []
-    assert text.count("| zsched | 3 |") >= 2
-
-
-def test_zsched_stands_beside_schemes_that_move_also_where_no_fixed_one_was_run() -> None:
-    moving = [{**one, "scheme": "oracle" if one["scheme"] == "fixed_e3" else one["scheme"]} for one in the_runs()]
-    parts = gains_parts(results_of([one for one in moving if not one["scheme"].startswith("fixed")]))
-    rows = [line for line in parts[-1].splitlines() if line.startswith("| nano")]
-
-    assert [row.split(" | ")[1] for row in rows] == ["dyna_both", "oracle"]
-    assert rows[0].startswith("| nano | dyna_both | 3 | -7 % [")  # 0.66 of 0.71
-    assert rows[1].startswith("| nano | oracle | 3 | +61 % [")  # 0.66 of 0.41
-    assert "fixed" not in "".join(parts)
-    assert gains_parts(results_of([one for one in moving if one["scheme"] == "zsched"])) == []
-
-
-def test_schemes_stand_where_they_stand() -> None:
-    results = results_of(the_runs())
-    table = gains_text(results, ("zsched", "dyna_both", "oracle"))
-    rows = [line.split(" | ")[1] for line in table.splitlines()[2:]]
-    assert rows == ["dyna_both", "zsched"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from zsched.core.values.fleet import Timing
-from zsched_lab.sim.site import ELECTORS, Played, fleet_of, main, play, shares, spread, table
+from zsched_lab.sim.site import ELECTORS, Played, fleet_of, play, shares
 
 
 @pytest.fixture(scope="module")
@@ -42,16 +42,3 @@ def test_a_larger_fleet_has_five_electors_and_its_edges_are_the_candidates() -> 
 def test_machines_are_shared_out_evenly() -> None:
     assert shares(10, 3) == [4, 3, 3]
     assert sum(shares(1000, 50)) == 1000
-
-
-def test_the_table_has_a_column_for_each_fault(cell: Played) -> None:
-    text = table({"one cell": [cell], "twice": [cell, cell]})
-    assert "owner frozen, ms: first; all" in text
-    assert len({line.count("|") for line in text.splitlines()}) == 1
-    assert spread([0.001, 0.002]) == "2 / 2 / 2"
-
-
-def test_a_cell_needs_a_robot_and_a_candidate(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--robots", "3", "--candidates", "1", "--cells", "2"])
-    assert "each needs a robot and a candidate" in capsys.readouterr().err

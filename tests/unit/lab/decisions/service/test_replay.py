@@ -294,42 +294,6 @@ def cells(text: str, first: str) -> list[str]:
     return [cell.strip() for cell in next(one for one in text.splitlines() if one.startswith(first)).split("|")[1:-1]]
 
 
-def test_every_length_of_load_has_every_rule_s_figures_and_its_goals() -> None:
-    rows = [
-        row(rule, seed, lost=lost + 0.01 * (seed - 101), load_s=load_s)
-        for load_s, figures in ((5.0, {"oracle": 0.02, "service": 0.03, "argmax": 0.05, "paper": 0.04}),
-                                (60.0, {"oracle": 0.02, "service": 0.025, "argmax": 0.022, "paper": 0.03}))
-        for rule, lost in figures.items()
-        for seed in (100, 101, 102)
-    ]  # fmt: skip
-    text = tables.lengths(rows, "x")
-    assert cells(text, "| argmax") == ["argmax", "5.00, 4.00, 8, 2", "2.20, 4.00, 8, 2"]
-    assert cells(text, "| service") == ["service", "3.00, 4.00, 8, 2", "2.50, 4.00, 8, 2"]
-    goals = tables.goals(rows, "x")
-    assert cells(goals, "| 5 s") == [
-        "5 s",
-        "3.00",
-        "paper, +1.00 ± 0.00, 3 of 3",
-        "met",
-        "1.50, missed",
-        "25 %, missed",
-    ]
-    assert cells(goals, "| 60 s") == [
-        "60 s",
-        "2.50",
-        "argmax, -0.30 ± 0.00, 0 of 3",
-        "missed",
-        "1.25, met",
-        "25 %, missed",
-    ]
-
-
-def test_moves_between_equal_machines_are_told_by_the_hour_and_by_seed() -> None:
-    rows = [row("service", 100, moves=0), row("service", 101, moves=3, size=1.15)]
-    assert cells(tables.equal(rows), "| service | up") == ["service", "up to 1", "0.5", "0.00", "0 of 1", "0.0"]
-    assert cells(tables.equal(rows), "| service | over") == ["service", "over 1", "0.5", "6.00", "1 of 1", "6.0"]
-
-
 def test_a_reading_has_the_spikes_of_its_machine_s_use() -> None:
     kinds = (
         Spikes(below=0.5, every_s=2.0, height=(0.3, 0.5), length_s=(0.2, 0.4)),
