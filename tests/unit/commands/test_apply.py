@@ -205,16 +205,6 @@ def test_a_plan_shows_before_and_after_in_the_files_words_and_changes_nothing(no
     assert [one["path"] for one in body["changes"]] == ["tasks.merge.weights.cpu", "tasks.merge.weights.memory"]
 
 
-@pytest.mark.usefixtures("node")
-def test_a_plan_fits_a_terminal(screen: int, tmp_path: Path) -> None:
-    file = changed(tmp_path, "fleet: hall", "shared_memory: auto\nfleet: hall")
-    lines = run("apply", file, "--plan").stdout.splitlines()
-    assert (max(map(len, lines)) <= screen, len(lines) > 3) == (True, True)
-    assert " ".join(" ".join(lines).split()).startswith("hall, revision 7: shared_memory off -> auto every daemon must")
-    assert run("fleet", "show").exit_code == 0
-    assert max(map(len, run("fleet", "show").stdout.splitlines())) <= screen
-
-
 def test_what_a_daemon_cannot_take_over_while_it_runs_is_told_with_its_nodes(node: Node, tmp_path: Path) -> None:
     file = changed(tmp_path, "fleet: hall", "shared_memory: auto\nfleet: hall")
     result = run("apply", file, "--plan")
@@ -275,12 +265,6 @@ def test_off_a_terminal_the_command_with_yes_is_printed_and_that_command_works(n
     assert node.text == file.read_text()
 
 
-def test_stdin_is_a_file_called_minus(node: Node) -> None:
-    text = TEXT.replace("cpu: 0.5, memory: 0.5", "cpu: 1")
-    assert run("apply", "-", "--yes", stdin=text).exit_code == 0
-    assert node.text == text
-
-
 def test_a_revision_that_was_overtaken_is_refused_with_the_one_there_is(node: Node, tmp_path: Path) -> None:
     file = changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1")
     result = run("apply", file, "--yes", "--revision", 6)
@@ -312,17 +296,6 @@ def test_another_document_or_a_revision_that_was_named_is_not_overtaken(
     assert "conflict: it was overtaken" in result.stderr
 
 
-@pytest.mark.parametrize(("outcome", "code"), [("conflict", 1), ("invalid", 1), ("no_quorum", 4), ("unknown", 5)])
-def test_what_does_not_come_about_has_its_exit_code(
-    node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
-) -> None:
-    monkeypatch.setattr(verbs, "OVERTAKEN_S", 0.2)
-    node.outcome = outcome
-    result = run("apply", changed(tmp_path, "cpu: 0.5, memory: 0.5", "cpu: 1"), "--yes")
-    assert result.exit_code == code
-    assert ("it was so" in result.stderr, f"{outcome}: it" in result.stderr) == (True, outcome != "no_quorum")
-
-
 def test_a_danger_is_accepted_by_its_name_only(node: Node, tmp_path: Path) -> None:
     file = tmp_path / "new.yaml"
     file.write_text(TEXT[: TEXT.index("tasks:")] + "tasks: {}\n")
@@ -347,16 +320,6 @@ def test_faults_are_those_of_check_and_another_fleets_file_is_refused(node: Node
     assert "is the file of fleet yard, and this is fleet hall; ask a node of yard with --connect" in result.stderr
     assert run("apply", tmp_path / "absent.yaml").exit_code == 78
     assert node.changes == []
-
-
-def test_a_node_that_is_still_fetching_the_document_cannot_be_asked_what_would_change(
-    node: Node, tmp_path: Path
-) -> None:
-    file = changed(tmp_path, "the large one", "the north one")
-    node.is_fetching = True
-    result = run("apply", file, "--plan")
-    assert result.exit_code == 1
-    assert "robot1 has not fetched document ab12ab12ab12 yet; ask another node with --node" in result.stderr
 
 
 def test_a_change_that_stops_half_way_says_how_far_it_came(node: Node, tmp_path: Path) -> None:
@@ -460,17 +423,6 @@ def test_faults_of_a_new_task_name_the_operator_s_own_file_and_its_lines(node: N
     assert "\n          weights: {cpu: 1, memory: -1}\n" in told
     assert DOCUMENT not in told
     assert node.changes == []
-
-
-def test_a_fault_between_a_new_task_and_another_one_names_the_place_of_each(node: Node, tmp_path: Path) -> None:
-    rule = '    outputs: [{from: "{target}/NAME/{epoch}/out", to: "{robot}/map"}]\n'
-    node.text = TEXT + rule.replace("NAME", "merge")
-    file = tmp_path / "again.yaml"
-    entry = node.text.partition("tasks:\n")[2].replace("  merge:", "  again:")
-    file.write_text(f"tasks:\n{entry}".replace("/merge/", "/again/"))
-    result = run("task", "add", file, "--yes")
-    assert f"rules: again/out/0 at {file}:5:" in result.stderr, result.stderr
-    assert f", merge/out/0 at {DOCUMENT}:11:" in result.stderr, result.stderr
 
 
 def test_a_document_that_names_no_electors_is_not_warned_of_those_that_a_first_file_would_have(

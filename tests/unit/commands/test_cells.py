@@ -41,17 +41,6 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
 
 
 @pytest.mark.parametrize("words", VERBS)
-@pytest.mark.parametrize("flags", [(), ("--json",)])
-def test_nobody_to_ask_is_said_and_is_no_success(
-    machine: Places, words: tuple[str, ...], flags: tuple[str, ...]
-) -> None:
-    machine.config.write_text(FILE)
-    result = run(*words, *flags)
-    assert (result.exit_code, result.stdout) == (3, "")
-    assert "no daemon answers on this machine, and what it has of fleet hall-a names no other" in result.stderr
-
-
-@pytest.mark.parametrize("words", VERBS)
 def test_the_cells_are_those_of_the_stored_document(
     machine: Places, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
@@ -73,11 +62,3 @@ def test_the_cells_are_those_of_the_stored_document(
     assert asked == ["tcp/192.0.2.31:7457"]
     machine.config.write_text(FILE.replace("hall-a", "hall-c"))
     assert "what it has of fleet hall-c names no other" in run(*words).stderr, "another fleet's document is not meant"
-
-
-@pytest.mark.parametrize(
-    "words", [("--connect", "tcp/127.0.0.1:1"), ("--node", "hall-b/robot7"), ("--watch",), ("-v",)]
-)
-def test_a_site_is_asked_whole_and_once(words: tuple[str, ...]) -> None:
-    result = run("status", "--site", *words)
-    assert (result.exit_code, result.stdout, "leave out" in result.stderr) == (2, "", True)

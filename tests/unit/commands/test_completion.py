@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from zsched import __version__
 from zsched.cli import app
 from zsched.commands.completion import script_file
 from zsched.host.operator_socket import OperatorSocket
@@ -105,8 +104,3 @@ def test_bash_completes_a_task_s_name(tmp_path: Path) -> None:
     script += f'COMP_WORDS=({program} tune m); COMP_CWORD=2; _zsched {program}; echo "${{COMPREPLY[@]}}"\n'
     done = subprocess.run(["bash"], input=script, capture_output=True, text=True, timeout=60, check=False)
     assert (done.stdout, done.stderr) == ("merge\n", "")
-
-
-def test_version_as_an_option_is_one_line() -> None:
-    result = CliRunner().invoke(app, ["--version"])
-    assert (result.exit_code, result.stdout) == (0, f"zsched {__version__}\n")

@@ -154,25 +154,6 @@ def test_the_line_of_the_utility_is_what_the_core_reckons(score: str, said: str)
     assert formula_of({"tuning": tuning, "candidates": []}) == ""
 
 
-@pytest.mark.parametrize(("knows", "is_said"), [(False, True), (True, False), (None, False)])
-def test_a_deadline_that_does_not_count_yet_is_said(
-    fleet: Fleet, capsys: pytest.CaptureFixture[str], knows: bool | None, is_said: bool
-) -> None:
-    """Until a worker has told what a job takes, the task is judged without its deadline."""
-    answer = fleet.answers[None]
-    one = answer.decision
-    tuning = replace(VALUE.tuning, score=ScoreForm.SERVICE, deadline_ms=100.0)
-    figures = replace(one.figures, allocation=replace(VALUE, tuning=tuning))
-    fleet.answers[None] = replace(answer, decision=replace(one, figures=figures), knows_jobs=knows)
-    assert asked() == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "deadline 100 ms" in told
-    assert ("does not count yet: how long a job takes is not known" in told) is is_said
-    assert asked(is_json=True) == 0
-    body = json.loads(capsys.readouterr().out)
-    assert (faults(body), body["knows_jobs"]) == ([], knows)
-
-
 @pytest.mark.usefixtures("fleet")
 def test_what_is_printed_adds_up(capsys: pytest.CaptureFixture[str]) -> None:
     assert asked() == 0
@@ -229,14 +210,6 @@ def test_a_plan_says_where_the_task_would_go(capsys: pytest.CaptureFixture[str])
     ) or (body["plan"]["outcome"] == "stay")
 
 
-@pytest.mark.parametrize("plan", ["edge1", "edge1=up", "=down"])
-def test_a_plan_of_another_form_is_refused_before_anybody_is_asked(fleet: Fleet, plan: str) -> None:
-    with pytest.raises(CliError, match="NODE=down") as refused:
-        asked(plan=plan)
-    assert refused.value.code == EXIT_USAGE
-    assert fleet.asked == []
-
-
 @pytest.mark.usefixtures("fleet")
 def test_a_plan_for_a_node_that_is_not_there_names_the_nearest() -> None:
     with pytest.raises(CliError, match="did you mean edge") as refused:
@@ -253,16 +226,6 @@ def test_an_edge_sends_the_question_on_and_says_so_when_it_was_meant(
     assert fleet.asked == [None, "robot1"]
     with pytest.raises(CliError, match="ask a robot: --node robot1"):
         asked("edge1")
-
-
-def test_an_unknown_task_and_no_judgement_yet_are_refused(fleet: Fleet) -> None:
-    with pytest.raises(CliError, match="there are merge") as refused:
-        asked(task="merg")
-    assert refused.value.code == EXIT_USAGE
-    fleet.answers[None] = Explanation(node="robot1", kind="robot", task="merge", allocation=VALUE, robots=ROBOTS)
-    with pytest.raises(CliError, match="has judged nothing of merge yet") as early:
-        asked()
-    assert early.value.code == EXIT_FAILED
 
 
 # --- what one robot sees ---------------------------------------------------------------------------------------------
@@ -298,13 +261,6 @@ def test_of_a_robot_that_does_not_answer_another_tells_what_it_heard(
     assert "0.6250" in captured.out
     assert asked(robot="robot3") == 0
     assert "robot1 has no utilities of robot3" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("fleet")
-def test_a_robot_that_is_none_is_refused_with_the_nearest() -> None:
-    with pytest.raises(CliError, match="did you mean robot") as refused:
-        asked(robot="robo2")
-    assert refused.value.code == EXIT_USAGE
 
 
 # --- a judgement of the past -----------------------------------------------------------------------------------------
@@ -377,15 +333,6 @@ def test_the_judgement_that_made_an_epoch_is_told_whole_with_its_move(capsys: py
     assert "VOTE" not in text
     assert asked(at="4", robot="robot2") == 0
     assert "0.1100" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("past")
-def test_an_age_and_a_time_name_the_newest_judgement_until_then(capsys: pytest.CaptureFixture[str]) -> None:
-    for word, cpu in (("10s", 0.44), ("101s", 0.33), ("200s", 0.22), ("1970-01-01T00:25:00Z", 0.22)):
-        assert asked(at=word, is_json=True) == 0
-        body = json.loads(capsys.readouterr().out)
-        assert faults(body) == []
-        assert (cpu_of_owner(body), body["made"]) == (cpu, None), word
 
 
 def test_a_past_that_is_not_there_is_said_with_what_there_is(past: Fleet, tmp_path: Path) -> None:

@@ -154,29 +154,6 @@ def test_a_drain_without_a_time_ends_by_hand_only_also_where_one_had_a_time(daem
     assert "ends by hand only (edge2, was for 30s)." in run("drain", "edge2", "--only", "new", "--yes").stdout
 
 
-@pytest.mark.parametrize("words", [("drain", "edge1"), ("drain", "edge1", "--only", "new")])
-def test_off_a_terminal_nothing_is_done_and_the_command_is_printed(daemon: Daemon, words: tuple[str, ...]) -> None:
-    result = run(*words)
-    assert (result.exit_code, daemon.changes) == (2, [])
-    assert result.stdout.splitlines()[0].split() == ["WHAT", "KIND", "NOW", "AFTER"]
-    assert "to do it:\nzsched " in result.stderr
-
-
-def test_a_plan_shows_the_nodes_and_what_becomes_of_their_tasks(daemon: Daemon) -> None:
-    daemon.status["tasks"][1]["pin"] = {"node": "edge1", "is_hard": True, "by": "a", "reason": "", "for_s": None}
-    result = run("drain", "edge1", "--plan", "-m", "new fan", "--for", "2h")
-    assert result.exit_code == 10
-    lines = [line.split(None, 3) for line in result.stdout.splitlines()]
-    assert lines[1][:3] == ["edge1", "drain", "-"]
-    assert lines[1][3].startswith("drained, for 2h00m, ")
-    assert lines[1][3].endswith("@robot1: new fan")
-    assert lines[2] == ["echo", "owner", "edge1", "one of edge2"]
-    assert lines[3] == ["merge", "owner", "edge1", "stays: it is pinned to edge1 (hard)"]
-    (planned,) = events("drain", "edge1", "--plan")
-    assert (planned["event"], planned["nodes"], planned["tasks"]) == ("planned", ["edge1"], ["echo", "merge"])
-    assert daemon.changes == []
-
-
 def test_several_nodes_are_flagged_by_one_change_that_keeps_the_other_flags(daemon: Daemon) -> None:
     other = {"kind": "ineligible", "subject": "robot1", "by": "b", "reason": "", "for_s": None, "revision": 2}
     daemon.flags = [other]
@@ -306,13 +283,6 @@ def test_a_fleet_without_an_agreed_document_says_what_to_do(daemon: Daemon, monk
     assert result.stderr.endswith("(`zsched dev` has none to keep)\n")
 
 
-def test_an_overtaken_revision_and_an_unknown_node_are_refused(daemon: Daemon) -> None:
-    assert "revision 3 is overtaken" in run("drain", "edge1", "--yes", "--revision", "3").stderr
-    wrong = run("drain", "edge9", "--yes")
-    assert (wrong.exit_code, daemon.changes) == (2, [])
-    assert "did you mean edge" in wrong.stderr
-
-
 def test_undrain_takes_every_drain_back(daemon: Daemon) -> None:
     said = {"by": "ada@robot1", "reason": "", "for_s": None, "revision": 2, "subject": "edge1"}
     daemon.set_flags([{"kind": "drain", **said}, {"kind": "ineligible", **said}])
@@ -377,21 +347,6 @@ def test_nodes_that_get_nothing_new_keep_their_tasks_and_are_not_watched(daemon:
     result = run("drain", "edge1", "--only", "new", "--yes")
     assert (result.exit_code, [line.split()[0] for line in result.stdout.splitlines()]) == (0, ["WHAT", "edge1", "It"])
     assert [flag["kind"] for flag in daemon.flags] == ["ineligible"]
-
-
-def test_a_word_that_is_no_drain_and_a_self_elsewhere_are_refused(daemon: Daemon) -> None:
-    assert run("drain", "edge1", "--only", "old").exit_code == 2
-    assert run("drain", "--self", "--node", "robot1").exit_code == 2
-    assert run("drain", "--self", "--plan").stdout.splitlines()[1].split()[:2] == ["robot1", "drain"]
-    assert daemon.changes == []
-
-
-@pytest.mark.parametrize("reason", ["new fan\n2026-11-24 INFO forged", "\x1b[2J", "\udcff", "x" * 201])
-def test_a_reason_that_is_not_one_short_line_is_refused(daemon: Daemon, reason: str) -> None:
-    done = run("drain", "edge1", "--yes", "--detach", "-m", reason)
-    assert done.exit_code == 2
-    assert "--reason: " in done.stderr
-    assert daemon.changes == []
 
 
 def test_the_end_of_a_rehearsals_drain_leaves_one_that_was_given_without_a_reason(

@@ -17,10 +17,8 @@ from support.schemas import faults
 from zsched.cli import app
 from zsched.commands.base.ask import Door
 from zsched.commands.base.common import CliError
-from zsched.commands.base.page import duration_s
 from zsched.commands.look import history as verb
 from zsched.commands.look import history as verbs
-from zsched.commands.look.history import subject_of, types_of
 from zsched.core.scheduler.decision import decide_again, verdict_of
 from zsched.core.values.decision import Decision, Move
 from zsched.core.values.exits import EXIT_UNREACHABLE, EXIT_USAGE
@@ -144,25 +142,6 @@ def test_moves_are_told_with_age_wall_time_votes_and_how_long_the_streams_took(
     ]
 
 
-@pytest.mark.usefixtures("pages", "screen")
-def test_on_a_terminal_of_80_columns_no_line_is_longer(capsys: pytest.CaptureFixture[str]) -> None:
-    assert history(HERE, "merge", is_json=False) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        " 1m30s ago  2026-09-21T14:11:50.000Z  merge epoch 2  edge1 -> edge2: edge1 is",
-        "            gone (robot1, robot2 for edge2; robot3 for edge1), streams switched",
-        "            in 86 ms, answers 300 ms apart",
-    ]
-
-
-@pytest.mark.usefixtures("screen")
-def test_a_long_event_goes_on_in_its_next_line_on_a_terminal(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
-    pages.entries = [entry("move to edge2 on revision 3: " + "committed again " * 6, 60.0)]
-    assert events(HERE) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("2026-09-21T14:12:20.000Z vote       task=merge epoch=2 move to edge2 on")
-    assert (len(lines), max(map(len, lines)) <= 80, lines[1].startswith("    ")) == (3, True, True)
-
-
 def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
     older = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart", "is_known": True}
     known = {**older, "reason": "as it was", "is_known": True}
@@ -181,20 +160,6 @@ def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: py
     assert history(HERE, None, is_json=True) == 0
     body = json.loads(capsys.readouterr().out)
     assert (faults(body), [one["is_known"] for one in body["moves"]]) == ([], [True, True])
-
-
-def test_a_changed_worker_that_waits_for_a_look_is_part_of_the_history(
-    pages: Pages, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pages.entries = [entry("changed worker: edge2 first, the others wait", 50.0, is_rollout=True)]
-    assert history(HERE, "merge", is_json=False) == 0
-    line = "   50s ago  2026-09-21T14:12:30.000Z  merge changed worker: edge2 first, the others wait"
-    assert capsys.readouterr().out.splitlines() == [line]
-    assert history(HERE, "merge", is_json=True) == 0
-    body = json.loads(capsys.readouterr().out)
-    assert (faults(body), [one["task"] for one in body["rollouts"]]) == ([], ["merge"])
-    assert history(HERE, "other", is_json=False) == 0
-    assert capsys.readouterr().out == "no move and no order of other in the log of robot1\n"
 
 
 def test_what_operators_have_changed_is_part_of_the_history_with_their_names(
@@ -324,31 +289,6 @@ def test_a_node_that_cannot_read_its_log_says_so(monkeypatch: pytest.MonkeyPatch
         history(Door(socket=Path("s"), node="robot2"), None, is_json=False)
 
 
-@pytest.mark.parametrize("word", ["10", "m", "-5m", "1w", "1.5.2h", "", "\u0663m", f"{'9' * 400}d"])
-def test_what_is_no_duration_is_refused(word: str) -> None:
-    with pytest.raises(CliError, match="no duration"):
-        duration_s(word)
-
-
-def test_durations_and_the_word_for_a_task() -> None:
-    assert [duration_s(word) for word in ("90s", "1.5m", "2h", "1d")] == [90.0, 90.0, 7200.0, 86400.0]
-    assert subject_of("task/merge") == ("merge", None)
-    assert subject_of("node/edge1") == (None, "edge1")
-    for word in ("merge", "task/", "node/", "robot/robot1"):
-        with pytest.raises(CliError, match="task/NAME or node/NAME"):
-            subject_of(word)
-
-
-@pytest.mark.usefixtures("pages")
-def test_moves_of_one_node_are_those_that_came_to_it_or_left_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert history(HERE, None, about="edge1", is_json=True) == 0
-    assert [move["task"] for move in json.loads(capsys.readouterr().out)["moves"]] == ["merge"]
-    assert history(HERE, None, about="edge2", is_json=True) == 0
-    assert [move["task"] for move in json.loads(capsys.readouterr().out)["moves"]] == ["merge", "other"]
-    assert history(HERE, "merge", about="edge3", is_json=False) == 0
-    assert capsys.readouterr().out == "no move and no order of merge to edge3 or away from it in the log of robot1\n"
-
-
 @pytest.mark.usefixtures("pages")
 def test_a_name_that_neither_the_log_nor_the_fleet_has_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(CliError, match=r"^fleet hall has no task 'merg'; did you mean merge") as refused:
@@ -425,19 +365,6 @@ def test_the_first_judgement_that_differs_is_named(tmp_path: Path) -> None:
     assert (body["judged"], body["equal"], body["line"]) == (1, False, 3)
 
 
-@pytest.mark.parametrize("line", ["no json", "[1]", '{"decision":{"figures":{}}}', '{"decision":3}'])
-def test_what_is_no_log_is_refused_with_its_line(tmp_path: Path, line: str) -> None:
-    file = log_of(tmp_path, decision(0.5))
-    with file.open("a") as more:
-        more.write(f"{line}\n")
-    done = run("explain", "--replay", file)
-    assert done.exit_code == EXIT_USAGE
-    assert f"{file}:3: no line of a decision log" in done.stderr
-    assert run("explain", "--replay", tmp_path / "nothing").exit_code == EXIT_USAGE
-    (tmp_path / "empty").touch()
-    assert run("explain", "--replay", tmp_path / "empty").exit_code == EXIT_USAGE
-
-
 @pytest.mark.parametrize("cut", [1, 12, 60, 400])
 @pytest.mark.parametrize("filled", [b"", bytes(64)])
 def test_a_line_that_a_power_cut_has_torn_is_left_out_and_told(tmp_path: Path, cut: int, filled: bytes) -> None:
@@ -452,37 +379,3 @@ def test_a_line_that_a_power_cut_has_torn_is_left_out_and_told(tmp_path: Path, c
     body = json.loads(run("explain", "--replay", file, "--json").stdout)
     assert faults(body) == []
     assert (body["judged"], body["equal"], body["torn"]) == (2, True, [3])
-
-
-# --- what is chosen --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.usefixtures("pages")
-def test_moves_of_the_last_time_only(capsys: pytest.CaptureFixture[str]) -> None:
-    assert history(HERE, None, is_json=False, since_s=95.0) == 0
-    assert "edge1 -> edge2" in capsys.readouterr().out
-    assert history(HERE, "merge", is_json=False, since_s=60.0) == 0
-    assert capsys.readouterr().out == "no move and no order of merge of the last 1m00s in the log of robot1\n"
-
-
-def test_events_of_some_types_only(pages: Pages, capsys: pytest.CaptureFixture[str]) -> None:
-    pages.entries = [entry("a peer came", 9.0, stage="membership"), entry("learnt", 8.0, move=MOVE), entry("won", 7.0)]
-    assert events(HERE, types=("move",)) == 0
-    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["learnt"]
-    assert events(HERE, types=("membership", "scheduler")) == 0
-    assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["came"]
-
-
-def test_a_type_that_there_is_not_is_named_with_those_there_are() -> None:
-    assert types_of("move, vote") == ("move", "vote")
-    with pytest.raises(CliError, match="did you mean vote") as refused:
-        types_of("votes")
-    assert refused.value.code == EXIT_USAGE
-    with pytest.raises(CliError, match="no event is of type 'warning'; there are move, scheduler, vote"):
-        types_of("warning")
-
-
-@pytest.mark.parametrize("words", [(), ("echo", "--replay", "decisions.ndjson")])
-def test_a_task_or_a_log_is_explained(words: tuple[str, ...]) -> None:
-    done = run("explain", *words)
-    assert (done.exit_code, "name a task, or a decision log with --replay FILE" in done.stderr) == (EXIT_USAGE, True)

@@ -60,7 +60,6 @@ OTHERS = {
     *("stream list", "stream hz", "stream bw", "stream tail", "metrics print", "metrics write", "demo", "bench paper"),
 }
 """What changes no fleet; `pki` makes files for an authority."""
-LISTING = ("pin", "unpin", "pause", "resume", "tune", "drain", "undrain")
 
 
 def verbs() -> dict[str, set[str]]:
@@ -243,11 +242,3 @@ def test_a_version_of_json_that_there_is_not_ends_as_usage(
     result = run(monkeypatch, *verb.split(), *ORDERS.get(verb, ("file",)), "--yes", "--json=9")
     assert (result.exit_code, daemon.changes) == (2, [])
     assert result.stderr.endswith(" has the major version 1\n"), result.stderr
-
-
-@pytest.mark.parametrize("verb", LISTING)
-def test_given_nothing_it_lists_what_is_in_force(daemon: Daemon, monkeypatch: pytest.MonkeyPatch, verb: str) -> None:
-    daemon.task |= {"pin": daemon.hold, "pause": daemon.hold}
-    result = run(monkeypatch, verb)
-    assert (result.exit_code, daemon.changes) == (0, []), result.output
-    assert any(word in result.stdout for word in ("eve", "cpu=")), result.stdout

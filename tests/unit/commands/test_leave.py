@@ -17,7 +17,6 @@ from support.authorities import make_authority
 from support.fleet_values import fleet_value_of
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.base.renewing import UNIT_FOLDER
 from zsched.commands.members import leave
 from zsched.config.load import load_fleet
 from zsched.core.values.codec import as_plain
@@ -210,14 +209,6 @@ def test_it_hands_over_gives_its_seat_up_goes_out_of_the_document_and_ends(hall:
     assert places == sorted(places)
 
 
-@pytest.mark.usefixtures("hall")
-def test_on_a_terminal_no_line_of_the_plan_is_longer_than_it_is_wide(screen: int) -> None:
-    plan = run("--plan")
-    assert plan.exit_code == 10
-    words = [word for line in plan.stdout.splitlines() if len(line) > screen for word in line.split()]
-    assert [word for word in words if len(word) < screen - 4] == []
-
-
 def test_it_stays_until_the_others_have_the_new_document(hall: Hall) -> None:
     hall.fetches_after = 3
     done = run("--yes")
@@ -237,14 +228,6 @@ def test_it_goes_on_where_the_change_is_agreed_and_its_answer_was_lost(hall: Hal
     assert (done.exit_code, done.stderr, left(hall.folder)) == (0, "", RENAMED)
     assert hall.asked == ["robot3 flags leave", "robot1 writes", "leave"]
     assert "revision 9 is agreed, and robot3 is no node of it" in done.stdout
-
-
-def test_one_that_does_not_fetch_it_in_time_is_told(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(leave, "LEARN_S", 0.05)
-    hall.fetches_after = 10**9
-    done = run("--yes")
-    assert done.exit_code == 0
-    assert done.stderr == "robot2: not heard yet that robot3 has left; the others tell\n"
 
 
 @pytest.mark.usefixtures("hall")
@@ -538,11 +521,6 @@ def hold_authority(hall: Hall, fleet: str = "hall") -> Path:
     folder = hall.folder / "data" / "zsched" / "authority" / fleet
     make_authority(folder, fleet)
     return folder
-
-
-def test_the_place_that_is_named_is_the_one_where_the_unit_looks() -> None:
-    unit = (Path(__file__).parents[3] / "systemd" / "zsched-renew.service").read_text()
-    assert f"ConditionPathExistsGlob={UNIT_FOLDER}/*/authority.json\n" in unit
 
 
 @pytest.mark.parametrize("way", ["agreed", "not-told", "no daemon"])

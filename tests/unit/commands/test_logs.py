@@ -53,29 +53,6 @@ def test_an_error_that_is_kept_no_more_is_not_said_never_to_have_been_printed(da
     assert result.stderr == f"the worker of echo on edge1 has {told}"
 
 
-def test_logs_of_a_worker_that_has_printed_nothing_says_so(daemon: Daemon) -> None:
-    daemon.lines = []
-    result = run("logs", "echo")
-    told = "the worker of echo on edge1 has printed nothing since the daemon there started\n"
-    assert (result.exit_code, result.stdout, result.stderr) == (0, "", told)
-    assert run("logs", "echo", "--level", "error").stderr == told.replace("nothing", "nothing at error or above")
-
-
-def test_logs_of_a_node_that_starts_no_worker_says_so(daemon: Daemon) -> None:
-    daemon.is_here = False
-    result = run("logs", "echo", "robot2")
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert "robot2 starts no worker of echo" in result.stderr
-
-
-def test_logs_of_a_task_without_an_owner_needs_a_node(daemon: Daemon) -> None:
-    daemon.status["tasks"][0]["owner"] = None
-    result = run("logs", "echo")
-    assert result.exit_code == 1
-    assert "echo has no owner; name a node, there are edge1, edge2" in result.stderr
-    assert run("logs", "ecko").exit_code == run("logs", "echo", "egde1").exit_code == 2
-
-
 def test_logs_followed_prints_what_comes_and_starts_anew_with_another_daemon(folder: Path) -> None:
     with Daemon(folder) as daemon:
         daemon.lines = printed("one", "two", "three")
@@ -186,22 +163,6 @@ def test_restart_shows_what_becomes_of_the_worker_and_says_who_wants_it(daemon: 
     asked = daemon.asked[-1]
     assert (asked["verb"], asked["task"], asked["node"], asked["reason"]) == ("restart", "echo", "edge2", "new code")
     assert asked["by"].endswith("@robot1")
-
-
-def test_restart_of_the_owner_s_worker_says_that_the_task_pauses(daemon: Daemon) -> None:
-    refused = run("restart", "echo")
-    assert (refused.exit_code, [asked["verb"] for asked in daemon.asked]) == (2, ["status"])
-    assert "started again; the task pauses until it is ready" in refused.stdout
-    assert run("restart", "echo", "--yes").exit_code == 0
-    assert daemon.asked[-1]["node"] == "edge1"
-
-
-def test_restart_that_is_refused_exits_with_1(daemon: Daemon) -> None:
-    daemon.result = {"outcome": "invalid", "detail": "its worker does not run", "revision": None}
-    text, as_json = run("restart", "echo", "edge2", "--yes"), run("restart", "echo", "edge2", "--yes", "--json")
-    assert (text.exit_code, as_json.exit_code) == (1, 1)
-    assert "echo on edge2: its worker does not run" in text.stderr
-    assert faults(json.loads(as_json.stdout)) == []
 
 
 def test_restart_of_which_nobody_tells_the_end_may_have_been_done(daemon: Daemon) -> None:

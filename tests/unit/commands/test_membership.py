@@ -28,10 +28,9 @@ from support.schemas import faults
 from zsched.cli import app
 from zsched.commands.base.common import CliError
 from zsched.commands.base.places import Places
-from zsched.commands.base.renewing import UNIT_FOLDER, renew_advice
 from zsched.commands.members import belongings as membership_files
 from zsched.commands.members import membership, papers
-from zsched.commands.members.membership import Address, address_of, dial_order, how_to_start, own_address
+from zsched.commands.members.membership import Address, address_of, how_to_start, own_address
 from zsched.config.load import check_bytes, load_fleet
 from zsched.core.values.certificates import Role
 from zsched.core.values.codec import as_plain, document_hash, from_plain
@@ -167,12 +166,6 @@ def test_an_address_that_nobody_can_dial_is_refused(text: str) -> None:
         address_of(text)
 
 
-def test_who_dials_whom_is_kept_when_it_is_written_down() -> None:
-    fleet = check_bytes(TEXT.encode()).fleet
-    assert fleet is not None
-    assert dial_order(fleet) == ("robot1", "edge1"), "in the file's order; robot3 cannot be dialled"
-
-
 # --- create ----------------------------------------------------------------------------------------------------------
 
 
@@ -289,17 +282,6 @@ def test_what_the_timer_needs_to_renew_by_an_authority_is_said_when_it_is_made(
         "LoadCredential=passphrase:/root/FILE\n"
     )
     assert "write the passphrase to /root/FILE, which only root may read, then `sudo systemctl edit" in said
-
-
-def test_where_the_timer_looks_it_needs_nothing_but_a_passphrase(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/root")
-    plain = renew_advice(UNIT_FOLDER / "hall", "hall", is_locked=False)
-    assert plain.startswith("certificates last 30 days: on the machine with the key `sudo systemctl enable --now")
-    assert plain.endswith("else `zsched pki renew --deliver` there")
-    locked = renew_advice(UNIT_FOLDER / "hall", "hall", is_locked=True)
-    assert "with the lines `[Service]` `LoadCredential=passphrase:/root/FILE`; then on the machine" in locked
-    spaced = renew_advice(Path("/mnt/a stick"), "hall", is_locked=False)
-    assert '`Environment="ZSCHED_AUTHORITY=/mnt/a stick"` `ReadWritePaths="/mnt/a stick"`; then' in spaced
 
 
 def test_a_fleet_that_cannot_be_written_leaves_no_authority(tmp_path: Path, authority: Path) -> None:
@@ -462,13 +444,6 @@ def test_without_certificates_a_fleet_says_so_and_stays_where_strangers_are_not(
     assert not authority.exists()
 
 
-def test_create_refuses_what_is_no_name(tmp_path: Path) -> None:
-    for words in (("Hall", "--node", "robot1"), ("hall", "--node", "Robot 1")):
-        result = run("fleet", "create", *words, "--address", "127.0.0.1", *here(tmp_path))
-        assert result.exit_code == 2, "nobody has seen the file of which it would be a line"
-        assert not list(tmp_path.iterdir())
-
-
 # --- invite ----------------------------------------------------------------------------------------------------------
 
 
@@ -511,46 +486,6 @@ def test_a_node_without_an_address_dials_the_others(node: Node) -> None:
     assert "seeds" not in node.text
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "why"),
-    [
-        (("Robot2",), 2, "is not a name"),
-        (("robot1",), 1, "is a node of the fleet, and alive"),
-        (("robot3", "--address", "192.0.2.3"), 1, "is in the document already, as a robot"),
-        (("robot3", "--kind", "edge"), 1, "is in the document already, as a robot; without options"),
-        (("robot2", "--candidate-for", "marge"), 2, "has no task 'marge'; did you mean merge?"),
-        (("robot2", "--candidate-for", "count"), 1, "are a selection that robot2 is not in"),
-        (("robot2", "--address", "a b"), 2, "is no address"),
-        (("robot2", "--address", "93.184.216.34"), 1, "--accept open-network"),
-        (("robot2", "--csr", "/none"), 2, "has no certificates"),
-        (("robot2", "--address", "127.0.0.1:7460"), 78, "is already"),
-        (("robot2", "--revision", "3"), 1, "is overtaken"),
-    ],
-)
-def test_what_cannot_be_invited_changes_nothing(node: Node, words: tuple[str, ...], code: int, why: str) -> None:
-    result = run("invite", *words, "--yes")
-    assert result.exit_code == code, result.stderr
-    assert why in result.stderr
-    assert (result.stdout, node.changes) == ("", [])
-
-
-def test_a_kind_that_is_said_is_held_against_the_documents(node: Node) -> None:
-    node.states["edge1"] = "gone"
-    refused = run("invite", "edge1", "--kind", "robot", "--yes")
-    assert (refused.exit_code, refused.stdout) == (1, "")
-    assert "edge1 is in the document already, as an edge; without options" in refused.stderr
-    for words in (("edge1",), ("edge1", "--kind", "edge"), ("robot3", "--kind", "robot")):
-        assert run("invite", *words, "--yes").exit_code == 0
-    assert node.changes == []
-
-
-def test_off_a_terminal_an_invitation_takes_a_yes(node: Node) -> None:
-    result = run("invite", "robot2", "--address", "192.0.2.12")
-    assert result.exit_code == 2
-    assert "zsched invite robot2 --address 192.0.2.12 --yes" in result.stderr
-    assert node.changes == []
-
-
 def test_a_node_is_not_added_when_its_invitation_has_nowhere_to_go(node: Node, tmp_path: Path) -> None:
     """It would stay in the document, and everybody would miss a machine that nobody can bring."""
     result = run("invite", "robot2", "--address", "192.0.2.12", "--yes", "-o", tmp_path / "none" / "file")
@@ -577,13 +512,6 @@ def test_a_machine_that_joins_knows_which_changed_worker_waits_for_a_look(node: 
     invitation = decode_invitation(file.read_bytes())
     assert [one.first for one in invitation.document.rollouts] == [("robot1",)]
     assert document_hash(invitation.document) == invitation.value.document, "else it could not be stored there"
-
-
-def test_a_node_of_an_older_version_is_named(node: Node) -> None:
-    node.is_old = True
-    result = run("invite", "robot3")
-    assert result.exit_code == 1
-    assert "update zsched there" in result.stderr
 
 
 # --- join ------------------------------------------------------------------------------------------------------------
@@ -1144,17 +1072,6 @@ def test_a_key_and_authorities_that_lie_where_an_invitation_s_go_are_left_as_the
     place.write_text(brought.key if name == "key.pem" else brought.trusted)  # of a try that was broken off
     done = run("join", file, *here(folder))
     assert done.exit_code == 0, done.stderr
-
-
-def test_without_the_authority_the_invitation_says_what_is_missing(node: Node, tmp_path: Path) -> None:
-    node.text = TEXT.replace("tcp/", "tls/") + "security: {}\n"
-    result = run("invite", "robot2", "--yes")
-    assert result.exit_code == 0, result.stderr
-    assert "the invitation has no certificate" in result.stderr
-    assert decode_invitation(result.stdout.encode()).papers is None
-    file = tmp_path / "robot2.invite"
-    file.write_text(result.stdout)
-    assert "zsched pki issue robot2" in run("join", file, *here(tmp_path / "robot2")).stdout
 
 
 def test_a_file_that_stdout_is_is_private_before_anything_is_asked(node: Node, tmp_path: Path) -> None:

@@ -14,9 +14,7 @@ from typer.testing import CliRunner, Result
 from support.doors import STATUS, answering, living
 from support.schemas import faults
 from zsched.cli import app
-from zsched.commands.act.tune import KEYS, tuned
 from zsched.commands.base.change import user_name
-from zsched.commands.base.common import CliError
 from zsched.commands.base.report import render_brief, render_status
 from zsched.core.values.words import CREATION_STEP
 from zsched.host.operator_client import Json
@@ -83,45 +81,6 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
 
 def run(*words: str) -> Result:
     return CliRunner().invoke(app, list(words))
-
-
-@pytest.mark.parametrize(
-    "words", [("pause", "echo"), ("pin", "echo"), ("move", "echo", "edge2"), ("tune", "echo", "bonus=0.3")]
-)
-def test_off_a_terminal_an_order_is_shown_and_not_given(daemon: Daemon, words: tuple[str, ...]) -> None:
-    result = run(*words)
-    assert (result.exit_code, daemon.orders) == (2, [])
-    assert result.stdout.splitlines()[0].split() == ["TASK", "WHAT", "NOW", "AFTER"]
-    assert "nobody can be asked here; to do it:\nzsched " in result.stderr
-    assert result.stderr.rstrip().endswith("--yes")
-
-
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (("pause", "echo"), 10),
-        (("resume", "echo"), 0),
-        (("pin", "echo", "edge2", "--hard"), 10),
-        (("unpin", "echo"), 0),
-        (("move", "echo", "edge2"), 10),
-        (("move", "echo", "edge1"), 0),
-        (("tune", "echo", "bonus=0.3"), 10),
-        (("tune", "echo", "bonus=0.1"), 0),
-    ],
-)
-def test_a_plan_exits_with_10_when_something_would_change_and_gives_no_order(
-    daemon: Daemon, words: tuple[str, ...], code: int
-) -> None:
-    assert (run(*words, "--plan").exit_code, daemon.orders) == (code, [])
-    planned = run(*words, "--plan", "--json")
-    assert (planned.exit_code, faults(json.loads(planned.stdout)), daemon.orders) == (code, [], [])
-
-
-@pytest.mark.parametrize("more", ["--plan", "--yes"])
-def test_no_task_is_pinned_to_a_node_that_is_no_candidate(daemon: Daemon, more: str) -> None:
-    result = run("pin", "echo", "robot1", more)
-    assert (result.exit_code, daemon.orders) == (1, [])
-    assert "echo: invalid: 'robot1' is no candidate; there are edge1, edge2" in result.stderr
 
 
 def test_a_pause_carries_who_why_and_how_long_and_is_listed(daemon: Daemon) -> None:
@@ -480,13 +439,6 @@ def test_settings_of_the_file_are_tuned_and_left_to_the_file_again(daemon: Daemo
     assert not {"price_s", "reach"} & set(daemon.orders[-1]["tuning"])
 
 
-def test_signals_that_no_link_could_lie_between_are_refused(daemon: Daemon) -> None:
-    daemon.status["tasks"][0] |= {"tuning": OWN, "file_tuning": OWN}
-    result = run("tune", "echo", "nu_dbm=-40", "--yes")
-    assert (result.exit_code, daemon.orders) == (2, [])
-    assert "nu_dbm (-40) must be below rho_dbm (-40)" in result.stderr
-
-
 @pytest.mark.parametrize(
     ("pair", "says"),
     [
@@ -540,29 +492,6 @@ def test_a_deadline_of_a_worker_that_tells_nothing_is_tuned_with_a_word(daemon: 
         assert (result.exit_code, said in result.stderr) == (0, is_said), result.output
     daemon.status["tasks"][0]["tuning"] = {**TUNING, "deadline_ms": 100.0}
     assert said not in run("tune", "echo", "bonus=0.2", "--yes").stderr, "that is not what is changed"
-
-
-def test_every_setting_can_be_set_back() -> None:
-    other = {**TUNING, "weights": {"cpu": 1.0, "memory": 0.0, "network": 0.0}, "bonus": 0.9, "score": "paper"}
-    assert tuned(other, OWN, [f"{key}=null" for key in KEYS]) == OWN
-    with pytest.raises(CliError, match="given twice"):
-        tuned(other, TUNING, ["bonus=1", "bonus=0"])
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("pause", "ecko", "--yes"),
-        ("pause", "echo", "--all", "--yes"),
-        ("pause", "echo", "--for", "soon", "--yes"),
-        ("pause", "echo", "--for", "0.5s", "--yes"),
-        ("pause", "echo", "-m", "x" * 201, "--yes"),
-        ("pause", "--all", "--revision", "7", "--yes"),
-        ("move", "echo", "edge9", "--yes"),
-    ],
-)
-def test_what_cannot_be_meant_is_a_usage_error(daemon: Daemon, words: tuple[str, ...]) -> None:
-    assert (run(*words).exit_code, daemon.orders) == (2, [])
 
 
 def test_who_gives_an_order_under_sudo_is_the_one_who_called_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -263,13 +263,3 @@ def test_a_full_disk_of_the_log_keeps_no_recovery_back(
     monkeypatch.setattr(decision_log, "note", refuse)
     assert recover(hall.place("robot1"), manner(is_yes=True, accepted=BOTH), ()) == EXIT_OK
     assert "does not tell of it: No space left on device" in capsys.readouterr().err
-
-
-def test_of_two_other_generations_one_must_be_named(hall: Hall) -> None:
-    hall.says("robot2", "11111111" * 4, "robot2")
-    hall.says("robot3", "22222222" * 4, "robot3")
-    code, text = refusal(lambda: rejoin(hall.place("robot1"), manner(is_yes=True), ""))
-    assert code == EXIT_FAILED
-    assert "name the generation to join; there are 11111111: robot2; 22222222: robot3" in text
-    _, text = refusal(lambda: rejoin(hall.place("robot1"), manner(is_yes=True), "3"))
-    assert "no node that answers is of a generation 3" in text

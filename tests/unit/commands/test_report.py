@@ -9,14 +9,12 @@ from __future__ import annotations
 import copy
 import json
 import os
-import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from support.fleets import tuning_of
-from zsched.commands.base.page import Page, cut, memory, size, span
 from zsched.commands.base.report import all_problems, degradations, render_status
 from zsched.core.values.model import Utility
 from zsched.core.values.plan import StreamCount
@@ -34,7 +32,6 @@ from zsched.core.values.snapshot import (
 
 RECORDED = Path(__file__).parent / "recorded_status"
 NAMES = ("healthy", "edge", "degraded")
-STAGES = ("PROFILE", "GATEWAY", "SCHEDULER", "VOTE", "EXECUTOR", "ROUTE")
 
 
 def recorded(name: str) -> dict[str, Any]:
@@ -152,51 +149,6 @@ def test_no_line_is_longer_than_the_terminal(name: str, width: int) -> None:
     assert max(map(len, render_status(status, width, color=False).splitlines())) <= width
 
 
-def test_stages_stand_in_the_order_of_the_design() -> None:
-    text = render_status(recorded("healthy"), 100, color=False)
-    starts = [re.search(rf"^{stage}\b", text, re.MULTILINE) for stage in STAGES]
-    places = [match.start() for match in starts if match]
-    assert len(places) == 6
-    assert places == sorted(places)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_colour_changes_nothing_but_colour(name: str) -> None:
-    plain = render_status(recorded(name), 100, color=False)
-    coloured = render_status(recorded(name), 100, color=True)
-    assert "\x1b[" in coloured
-    assert "\x1b" not in plain
-    assert re.sub(r"\x1b\[[0-9;]*m", "", coloured) == plain
-
-
-def test_more_robots_than_fit_are_counted() -> None:
-    status = recorded("healthy")
-    utilities = status["tasks"][0]["decision"]["utilities"]
-    column = utilities["robot1"]
-    utilities.update({f"robot{i}": copy.deepcopy(column) for i in range(4, 21)})
-    lines = render_status(status, 80, color=False).splitlines()
-    (head,) = [line for line in lines if "candidate" in line]
-    shown = head.count("robot")
-    assert 0 < shown < 20
-    assert f"+{20 - shown}" in head
-
-
-def test_the_scheduler_shows_what_a_move_costs_where_the_daemon_tells_it() -> None:
-    status = recorded("healthy")
-    (told,) = [line for line in render_status(status, 120, color=False).splitlines() if "SCHEDULER" in line]
-    del status["tasks"][0]["tuning"]["price_s"]
-    (untold,) = [line for line in render_status(status, 120, color=False).splitlines() if "SCHEDULER" in line]
-    assert told.replace(" · a move costs 0.2 s", "") == untold != told
-
-
-def test_bonus_and_what_was_not_kept_stand_beside_the_candidate_they_change() -> None:
-    status = recorded("healthy")
-    status["tasks"][0]["decision"]["unkept"] = {"edge2": 0.05, "edge1": 0.0}
-    lines = {line.split()[0]: line for line in render_status(status, 100, color=False).splitlines()[12:] if line}
-    assert lines["edge1"].endswith("owner +0.1")
-    assert lines["edge2"].endswith("not kept -0.05")
-
-
 @pytest.mark.parametrize(
     ("trouble", "said"), [({}, "starting"), ({"trouble": "lost"}, "was ready"), ({"trouble": "again"}, "restarting")]
 )
@@ -211,16 +163,6 @@ def test_a_worker_that_was_ready_is_starting_in_no_row(trouble: dict[str, str], 
     status["nodes"][0]["workers"].append({**status["nodes"][0]["workers"][0], "task": "slam"})
     status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
     assert f"echo {said}, slam {said}" in render_status(status, 140, color=False)
-
-
-def test_several_tasks_and_workers_are_told_apart() -> None:
-    status = recorded("healthy")
-    status["tasks"].append({**copy.deepcopy(status["tasks"][0]), "name": "slam", "streams": []})
-    status["nodes"][0]["workers"].append({"task": "slam", "state": "failed", "cpu_cores": None, "memory_mb": None})
-    wide, narrow = render_status(status, 120, color=False), render_status(status, 80, color=False)
-    assert "echo ready, slam failed" in wide
-    assert "1 ready, 1 failed" in render_status(status, 84, color=False)
-    assert narrow.count("TASK ") == 2
 
 
 def test_nothing_known_yet_is_shown_as_such() -> None:
@@ -251,25 +193,6 @@ def test_the_first_line_tells_of_nodes_that_are_away(states: tuple[str, ...], sa
     assert render_status(status, 100, color=False).splitlines()[0].endswith(" 1 problem")
 
 
-def test_where_applications_join_stays_once_messages_flow() -> None:
-    status = recorded("healthy")
-    status["joins_at"] = ["tcp/127.0.0.1:7458"]
-    status["tasks"].append({**status["tasks"][0], "name": "slam", "streams": []})
-    assert all(stream["last_seen_s"] is not None for stream in status["tasks"][0]["streams"])
-    assert render_status(status, 100, color=False).count("applications here join at tcp/127.0.0.1:7458") == 1
-
-
-def test_where_applications_join_is_told_before_anything_is_counted() -> None:
-    status = recorded("healthy")
-    status["joins_at"] = ["tcp/127.0.0.1:7458"]
-    status["tasks"][0]["streams"] = []
-    told = render_status(status, 100, color=False)
-    assert "no streams here" in told
-    assert told.count("applications here join at tcp/127.0.0.1:7458") == 1
-    status["kind"] = "edge"
-    assert "applications here join" not in render_status(status, 100, color=False)
-
-
 @pytest.mark.parametrize(
     ("from_expr", "joins", "told"),
     [
@@ -290,24 +213,6 @@ def test_an_input_that_never_saw_a_message_says_what_it_waits_for(from_expr: str
     text = " ".join(render_status(status, 100, color=False).split())
     assert told in text
     assert text.count("waits for") == (1 if from_expr else 0), "an output waits for nobody's application"
-
-
-def test_an_input_that_had_messages_before_its_relays_start_waits_for_no_first_one() -> None:
-    status = recorded("healthy")
-    for stream in status["tasks"][0]["streams"]:
-        stream["last_seen_s"] = None
-        stream["from_expr"] = "robot1/mapp"
-    text = " ".join(render_status(status, 100, color=False).split())
-    assert "none since the relay's start or the stream's last change: waits for a message on robot1/mapp" in text
-    assert "nothing yet" not in text
-
-
-def test_an_input_that_has_seen_messages_waits_for_nothing() -> None:
-    status = recorded("healthy")
-    status["joins_at"] = ["tcp/127.0.0.1:7458"]
-    for stream in status["tasks"][0]["streams"]:
-        stream["from_expr"] = "robot1/in"
-    assert "waits for" not in render_status(status, 100, color=False)
 
 
 @pytest.mark.parametrize(
@@ -331,29 +236,7 @@ def test_a_worker_that_does_all_and_answers_nothing_may_put_it_under_another_key
     assert "PROBLEMS" not in told
 
 
-@pytest.mark.parametrize(
-    ("base", "has_quorum", "told"),
-    [
-        (0, True, "won edge1 · "),
-        (1, True, "won edge1, not agreed on yet"),
-        (1, False, "won edge1, no quorum to agree on it"),
-    ],
-)
-def test_a_vote_that_is_won_and_not_agreed_on_is_shown_as_such(base: int, has_quorum: bool, told: str) -> None:
-    status = recorded("healthy")
-    (task,) = status["tasks"]
-    assert task["revision"] == 1
-    task["vote"]["base_revision"] = base
-    status["quorum"]["ok"] = has_quorum
-    assert told in " ".join(render_status(status, 160, color=False).split())
-
-
 # --- degraded --------------------------------------------------------------------------------------------------------
-
-
-def test_healthy_fleet_is_not_degraded() -> None:
-    assert degradations(recorded("healthy")) == ()
-    assert degradations(recorded("edge")) == ()
 
 
 def test_a_lost_quorum_is_told_once_with_what_the_daemon_says_of_it() -> None:
@@ -370,20 +253,6 @@ def test_lost_quorum_and_lost_owner_are_degraded() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"owner": None, "owner_state": "none"}, ("echo has no owner (`zsched explain echo` says why)",)),
-        ({"owner_state": "unknown"}, ("echo: its owner edge1 is unknown",)),
-        ({"owner_state": "suspect"}, ()),  # in grace: it may still refute
-    ],
-)
-def test_owner_that_is_not_there_is_degraded(change: dict[str, Any], expected: tuple[str, ...]) -> None:
-    status = recorded("healthy")
-    status["tasks"][0].update(change)
-    assert degradations(status) == expected
-
-
 def test_failed_worker_of_the_owner_is_degraded_and_one_elsewhere_is_not() -> None:
     status = recorded("healthy")
     status["nodes"][1]["workers"][0]["state"] = "failed"
@@ -395,99 +264,6 @@ def test_failed_worker_of_the_owner_is_degraded_and_one_elsewhere_is_not() -> No
 
 
 # --- figures and lines -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (None, "-"),
-        (-0.2, "0.0s"),
-        (0.04, "0.0s"),
-        (9.94, "9.9s"),
-        (9.96, "10s"),
-        (59.4, "59s"),
-        (59.6, "1m00s"),
-        (3599.9, "1h00m"),
-        (86400.0 * 2 + 3600 * 4, "2d04h"),
-    ],
-)
-def test_durations(seconds: float | None, text: str) -> None:
-    assert span(seconds) == text
-
-
-def test_sizes() -> None:
-    assert [size(0), size(999), size(1000), size(1 << 20), size(5 << 40)] == [
-        "0 B",
-        "999 B",
-        "1.0 KiB",
-        "1.0 MiB",
-        "5120.0 GiB",
-    ]
-    assert [memory(98.4), memory(1000.0), memory(24064.0)] == ["98M", "1.0G", "23.5G"]
-
-
-def test_cut_shows_that_something_was_cut() -> None:
-    assert [cut("abcd", 4), cut("abcde", 4), cut("abc", 1), cut("abc", 0)] == ["abcd", "abc…", "…", ""]
-
-
-def test_block_breaks_between_its_parts_and_aligns_them() -> None:
-    page = Page(30, color=False)
-    page.block("VOTE", ("one two", ""), ("three four", ""), ("five", ""))
-    assert page.lines == ["VOTE       one two", "           three four · five"]
-
-
-def test_block_with_a_long_title_pushes_its_text_along() -> None:
-    page = Page(40, color=False)
-    page.block("TASK a_long_name", ("owned", ""))
-    assert page.lines == ["TASK a_long_name  owned"]
-
-
-@pytest.mark.parametrize(
-    ("age_s", "told"), [(303.0, "5m03s"), (2712.0, "45m"), (43_500.0, "12h"), (1_000_000.0, "11d")]
-)
-def test_an_age_of_a_node_fits_its_column(age_s: float, told: str) -> None:
-    status = recorded("healthy")
-    status["nodes"][0] |= {"state": "gone", "age_s": age_s, "speed": 0.713, "cpu_cores": 16.0, "memory_mb": 128_614.0}
-    line = next(line for line in render_status(status, 120, color=False).splitlines() if line.startswith("edge1 "))
-    assert f" {told} " in line
-    assert "of 16 x0.71 " in line
-    assert " 126G " in line
-    assert "…" not in line
-
-
-def test_speed_of_the_cores_what_a_starved_worker_wants_and_the_score_are_shown_where_there_is_room() -> None:
-    status = recorded("healthy")
-    (node, *_), (task, *_) = status["nodes"], status["tasks"]
-    node["speed"], node["workers"][0]["cpu_cores"], node["workers"][0]["wanted_cores"] = 0.713, 0.48, 1.0
-    task["tuning"]["score"] = "paper"
-    wide, narrow = (render_status(status, width, color=False) for width in (120, 80))
-    assert "of 2 x0.71 " in wide
-    assert "0.48 of 1.00 cores" in wide
-    assert "· by the paper's score" in wide
-    assert "x0.71" not in narrow
-    assert "paper's score" not in render_status(recorded("healthy"), 120, color=False)
-
-
-@pytest.mark.parametrize(
-    ("of_node", "of_worker", "is_shown"),
-    [
-        ({}, {}, True),
-        ({"state": "gone", "age_s": 15.0}, {}, False),
-        ({"state": "suspect"}, {}, False),
-        ({"age_s": 15.0}, {}, False),
-        ({}, {"state": "starting", "trouble": "lost"}, False),
-        ({}, {"state": "stopped", "reason": "killed by signal 9 (Killed)"}, False),
-    ],
-)
-def test_jobs_of_who_does_none_any_more_are_not_shown(
-    of_node: dict[str, Any], of_worker: dict[str, Any], *, is_shown: bool
-) -> None:
-    status = recorded("healthy")
-    node = status["nodes"][0]
-    node.update(of_node)
-    jobs = {"time_s": 0.02, "cpu_s": 0.01, "done_hz": 47.5, "wanted_hz": 47.5, "backlog": 0}
-    node["workers"][0].update(jobs=jobs, **of_worker)
-    assert ("47.5 of 47.5 a second" in render_status(status, 120, color=False)) is is_shown
 
 
 def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_misses_it() -> None:
@@ -510,13 +286,3 @@ def test_what_a_worker_says_of_its_jobs_is_shown_with_the_deadline_and_what_miss
         assert f"deadline 100 ms, {late}\n" in render_status(status, 160, color=False), "workers count by the file"
     owner["workers"][0]["jobs"] = None
     assert "JOBS" not in render_status(status, 120, color=False), "nothing is told"
-
-
-def test_gauges_stand_under_the_nodes_where_any_is_measured() -> None:
-    status = recorded("healthy")
-    assert "GAUGES" not in render_status(status, width=100, color=False)
-    status["nodes"][0]["gauges"] = {"battery": 0.843, "temperature_c": 51.2}
-    status["nodes"][1]["gauges"] = {"gpu": 0.3, "wind": 4.0}
-    (line,) = (row for row in render_status(status, width=100, color=False).splitlines() if row.startswith("GAUGES"))
-    names = [node["name"] for node in status["nodes"]]
-    assert f"{names[0]} battery 84 % temperature_c 51 °C · {names[1]} gpu 30 % wind 4" in line

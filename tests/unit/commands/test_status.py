@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -23,12 +22,10 @@ from zsched.cli import app
 from zsched.commands.base import ask
 from zsched.commands.base.ask import ask_door, find_door
 from zsched.commands.base.common import CliError
-from zsched.commands.base.report import render_status
 from zsched.commands.look.status import _fitted
 from zsched.core.values.fleet import MOST_ORDER_S
 
 CLI = (sys.executable, "-m", "zsched.cli")
-RECORDED = Path(__file__).parent / "recorded_status"
 
 
 def run(*arguments: object) -> Result:
@@ -41,24 +38,6 @@ def test_status_shows_the_only_daemon_without_colour_off_a_terminal(daemon: Daem
     assert "TASK       owner" in result.stdout
     assert "\x1b" not in result.stdout
     assert daemon.asked == [{"verb": "status"}]
-
-
-def test_streams_are_listed_with_the_rates_of_the_window_not_the_daemon_s(daemon: Daemon) -> None:
-    for stream in daemon.status["tasks"][0]["streams"]:
-        stream |= {"hz": 77.0, "bytes_per_s": 7.0}
-    body = json.loads(run("stream", "list", "--window", "0.1", "--json").stdout)
-    assert faults(body) == []
-    assert [stream["hz"] for stream in body["streams"]] == [0.0, 0.0], "the recorded totals stand still"
-
-
-def test_status_with_v_shows_all_stages(daemon: Daemon) -> None:
-    assert daemon.status["node"] == "robot1"
-    short, whole = run("status").stdout, run("status", "-v").stdout
-    assert run("status", "--verbose").stdout.count("\n") == whole.count("\n") > short.count("\n")
-    for stage in ("PROFILE", "GATEWAY", "SCHEDULER", "VOTE", "EXECUTOR", "ROUTE"):
-        assert f"\n{stage} " in whole
-        assert stage not in short
-    assert re.search(r"known here for 4\.5s, since \d\d:\d\d:\d\d", whole)
 
 
 def test_status_as_json_is_the_answer_itself_and_why_the_fleet_is_degraded(daemon: Daemon) -> None:
@@ -84,18 +63,6 @@ def test_status_without_a_daemon_exits_with_3_and_says_where_it_looked(
     assert (result.exit_code, result.stdout) == (3, "")
     assert str(folder) in result.stderr
     assert "zsched join INVITATION" in result.stderr
-
-
-def test_status_at_a_socket_nobody_listens_on_exits_with_3(folder: Path) -> None:
-    with Daemon(folder) as left_behind:
-        path = folder / "robot1.sock"
-        kept = path.with_name("kept")
-        path.rename(kept)
-    kept.rename(path)
-    assert left_behind.asked == []
-    result = run("status")
-    assert result.exit_code == 3
-    assert str(path) in result.stderr
 
 
 def test_status_of_a_daemon_that_refuses_exits_with_1(daemon: Daemon) -> None:
@@ -240,13 +207,6 @@ def test_status_of_a_node_elsewhere_goes_through_a_daemon_here(daemon: Daemon) -
     assert daemon.asked[-1] == {"verb": "status", "node": "robot3"}
 
 
-def test_status_of_a_node_that_the_fleet_has_not_is_refused_with_the_nearest_name(daemon: Daemon) -> None:
-    result = run("status", "--node", "robo2")
-    assert result.exit_code == 2
-    assert "did you mean robot" in result.stderr
-    assert [asked for asked in daemon.asked if "node" in asked] == []
-
-
 def test_status_of_a_silent_node_elsewhere_exits_with_3(daemon: Daemon) -> None:
     answer = daemon._answer
     silent = {"error": "robot3 did not answer within 3 s; is it up and reachable?"}
@@ -257,19 +217,6 @@ def test_status_of_a_silent_node_elsewhere_exits_with_3(daemon: Daemon) -> None:
     assert "and none answers in the network; look at zsched on the machine of robot3" in result.stderr
     assert "zsched up" not in result.stderr, "a second daemon of that name is none to start here"
     assert "within 3 s" not in result.stderr, "it may have been told at once"
-
-
-def test_status_is_not_asked_twice_a_second_without_watch(daemon: Daemon) -> None:
-    run("status", "--interval", "0.1")
-    assert len(daemon.asked) == 1
-
-
-@pytest.mark.parametrize("interval", ["0", "soon"])
-def test_impossible_interval_is_a_usage_error(daemon: Daemon, interval: str) -> None:
-    result = run("status", "--watch", "--interval", interval)
-    assert result.exit_code == 2
-    assert "--interval" in result.stderr
-    assert daemon.asked == []
 
 
 def watch(folder: Path, *arguments: str) -> subprocess.Popen[str]:
@@ -338,25 +285,3 @@ def test_screen_that_is_too_low_keeps_the_problems(monkeypatch: pytest.MonkeyPat
     assert shown[-1] == "PROBLEMS no quorum"
     assert shown[6] == "line 6"
     assert shown[7].startswith("... 13 more lines")
-
-
-@pytest.mark.parametrize("height", [20, 24, 30])
-def test_many_problems_of_many_tasks_stay_in_the_lower_half_of_the_screen(
-    monkeypatch: pytest.MonkeyPatch, height: int
-) -> None:
-    monkeypatch.setenv("LINES", str(height))
-    status = json.loads((RECORDED / "healthy.json").read_text())
-    status["tasks"] = [{**status["tasks"][0], "name": f"task{number}"} for number in range(8)]
-    status["problems"] = [f"problem {number}" for number in range(20)]
-    shown = _fitted(render_status(status, 80, color=True))
-    lines = shown.replace("\x1b[K", "").replace("\x1b[H", "").replace("\x1b[J", "").split("\n")
-    assert len(lines) == height
-    assert lines[0].startswith("\x1b[1mfleet")
-    assert "PROBLEMS" in lines[height - height // 2 + 1]
-    assert "problem 0" in lines[height - height // 2 + 1]
-    assert lines[-1] == f"... {22 - height // 2} more lines of problems: a higher window shows them"
-
-
-def test_screen_that_is_high_enough_shows_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LINES", "10")
-    assert _fitted("\n".join("abcdefghij")).count("\n") == 9

@@ -18,14 +18,11 @@ from typer.testing import CliRunner, Result
 from support.authorities import install, make_authority
 from zsched import __version__
 from zsched.cli import app
-from zsched.commands.base.common import say
-from zsched.commands.look.ping import Question, Way, _lines, _ways
+from zsched.commands.look.ping import Question, _ways
 from zsched.config.load import load_fleet
-from zsched.core.values.fleet import fleet_hash
 from zsched.host.machine import core_speed
 from zsched.link.bus.node_ping import Pinged
 
-REPOSITORY = Path(__file__).parents[3]
 RECORDED = Path(__file__).parent / "recorded_status"
 
 FLEET = """
@@ -66,27 +63,6 @@ def test_check_of_a_good_file_counts_what_is_in_it(tmp_path: Path) -> None:
     assert body["fleet"] == {"name": "hall", "nodes": 3, "tasks": 1, "electors": 3}
 
 
-def test_check_names_the_tasks_whose_workers_somebody_else_starts(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    without = "; you start the workers of merge yourself (no `command`)\n"
-    assert run("check", file).stdout.endswith(without)
-    file.write_text(f"{FLEET}    worker: {{command: [sleep, '9']}}\n")
-    assert "yourself" not in run("check", file).stdout
-
-
-def test_check_tells_the_hash_by_which_a_daemon_names_the_file(tmp_path: Path) -> None:
-    file, other = tmp_path / "fleet.yaml", tmp_path / "other.yaml"
-    file.write_text(FLEET)
-    other.write_text(FLEET.replace("cpu: 0.5, memory: 0.5", "cpu: 0.6, memory: 0.4"))
-    digest = fleet_hash(load_fleet(file))
-    assert f"; hash {digest}" in run("check", file).stdout
-    assert json.loads(run("check", file, "--json").stdout)["hash"] == digest
-    assert json.loads(run("check", other, "--json").stdout)["hash"] not in (None, digest)
-    other.write_text("fleet: hall")
-    assert json.loads(run("check", other, "--json").stdout)["hash"] is None
-
-
 @pytest.mark.parametrize(
     ("scheduling", "words"),
     [
@@ -105,23 +81,6 @@ def test_check_says_in_words_when_a_task_moves(tmp_path: Path, scheduling: str, 
     assert [word for word in words if word not in text] == [], text
 
 
-def test_check_says_once_what_holds_for_several_tasks(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    head, task = FLEET.split("tasks:\n")
-    names = ("alike", "also", "other")
-    (name,) = (line.strip(" :") for line in task.splitlines() if line.startswith("  ") and line[2] != " ")
-    tasks = {one: task.replace(name, one) for one in names}
-    weights = next(line for line in tasks["other"].splitlines() if "weights:" in line)
-    tasks["other"] = tasks["other"].replace(weights, f"{weights}\n    scheduling: {{price_s: 0.7}}")
-    file.write_text(f"{head}tasks:\n" + "".join(text.rstrip() + "\n" for text in tasks.values()))
-    lines = run("check", file, "-v").stdout.splitlines()
-    assert [line.split(": a machine")[0] for line in lines if "a machine is worth" in line] == [
-        "tasks alike, also",
-        "other",
-    ], lines
-    assert len([line for line in lines if "it moves to the machine that owes least" in line]) == 2
-
-
 def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_78(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET.replace("kind: robot}\n  robot3", "kind: rowboat}\n  robot3").replace("cpu: 0.5", "cpu: 5"))
@@ -136,22 +95,6 @@ def test_check_of_a_bad_file_reports_every_fault_with_its_place_and_exits_with_7
     assert {"line", "col", "message", "hint", "source_line"} == set(body["faults"][0])
 
 
-def test_check_warns_on_stderr_and_still_exits_with_0(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET.replace("  robot3: {kind: robot}\n", ""))
-    result = run("check", file)
-    assert result.exit_code == 0
-    assert "warning" in result.stderr
-    assert result.stdout.startswith("ok: ")
-
-
-def test_check_of_a_missing_file_exits_with_78(tmp_path: Path) -> None:
-    result = run("check", tmp_path / "none.yaml")
-    assert "more may follow" not in result.stderr
-    assert result.exit_code == 78
-    assert "cannot be read" in result.stderr
-
-
 def test_check_takes_the_file_that_up_would(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text(FLEET)
@@ -162,20 +105,6 @@ def test_check_takes_the_file_that_up_would(tmp_path: Path, monkeypatch: pytest.
     result = run("check")
     assert result.exit_code == 78
     assert f"{tmp_path / 'none.yaml'}: error: cannot be read" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "hint"),
-    [
-        ("fleet: hall", "fleet: hall\ntiming: wlan", "did you mean 'wifi'?"),
-        ("fleet: hall", "fleet: hall\ntiming: ethernet", "did you mean 'wired'?"),
-        ("    weights", "    worker: {command: python stats.py}\n    weights", "write a list: [python, stats.py]"),
-    ],
-)
-def test_check_advises_what_would_work(tmp_path: Path, old: str, new: str, hint: str) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET.replace(old, new))
-    assert f"hint: {hint}\n" in run("check", file).stderr
 
 
 @pytest.mark.root
@@ -272,34 +201,6 @@ def test_a_recovery_with_force_alone_is_a_usage_error(tmp_path: Path) -> None:
     assert not (tmp_path / "state").exists()
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("--rejoin", "--settle"),
-        ("--generation", 1, "--settle"),
-        ("--generation", 1, "--plan"),
-        ("--settle", "--plan"),
-        ("8d3f",),
-        ("--rejoin", "--from", "state"),
-        ("--settle", "--from", "state"),
-    ],
-)
-def test_a_recovery_does_one_thing(tmp_path: Path, words: tuple[object, ...]) -> None:
-    result = run("fleet", "recover", "--state-dir", tmp_path / "state", *words)
-    assert (result.exit_code, result.stdout, " with" in result.stderr) == (2, "", True)
-    assert not (tmp_path / "state").exists()
-
-
-def test_init_says_whom_it_asked(tmp_path: Path) -> None:
-    """The only node with an address asks nobody, and says so; another one asks that one."""
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    first = run("init", "--config", file, "--node", "robot1", "--state-dir", tmp_path / "one")
-    assert first.stderr == "no other node has an address in the fleet file: nobody was asked\n"
-    second = run("init", "--config", file, "--node", "robot2", "--state-dir", tmp_path / "two")
-    assert second.stderr == "asked 1 other node: none answered, so nobody could say whether robot2 has voted\n"
-
-
 def test_init_of_a_secured_fleet_that_nobody_answers_for_warns_of_an_old_file(tmp_path: Path) -> None:
     """The file that `fleet create` wrote names the founder alone: whoever lost its state would be a fleet of one."""
     file = tmp_path / "fleet.yaml"
@@ -327,15 +228,6 @@ def test_init_in_another_nodes_folder_says_whose_it_is_and_leaves_it(tmp_path: P
     assert (state / "state").read_bytes() == before
 
 
-def test_init_of_a_name_that_is_not_in_the_file_exits_with_2(tmp_path: Path) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    result = run("init", "--config", file, "--node", "robot9", "--state-dir", tmp_path / "state")
-    assert result.exit_code == 2
-    assert "there are robot1, robot2, robot3" in result.stderr
-    assert not (tmp_path / "state").exists()
-
-
 @pytest.mark.parametrize(("name", "said"), [("robt2", "did you mean 'robot2'? Say which"), ("hut", "); say which")])
 def test_init_of_a_name_that_is_not_in_the_file_suggests_the_nearest(tmp_path: Path, name: str, said: str) -> None:
     file = tmp_path / "fleet.yaml"
@@ -344,23 +236,6 @@ def test_init_of_a_name_that_is_not_in_the_file_suggests_the_nearest(tmp_path: P
     assert result.exit_code == 2
     assert f"no node {name!r} under 'nodes' (there are robot1, robot2, robot3); " in result.stderr
     assert said in result.stderr
-
-
-@pytest.mark.parametrize("verb", ["up", "init"])
-def test_word_that_is_no_name_is_a_usage_error(tmp_path: Path, verb: str) -> None:
-    file = tmp_path / "fleet.yaml"
-    file.write_text(FLEET)
-    result = run(verb, "--config", file, "--node", "Robot 1")
-    assert result.exit_code == 2
-    assert "--node" in result.stderr
-
-
-def test_up_without_a_fleet_file_exits_with_78_and_says_which(tmp_path: Path) -> None:
-    result = run("up", "--config", tmp_path / "none.yaml", "--node", "robot1")
-    assert result.exit_code == 78
-    assert str(tmp_path / "none.yaml") in result.stderr
-    for way in ("--config", "zsched fleet create NAME", "zsched join INVITATION"):
-        assert way in result.stderr
 
 
 def test_demo_hands_its_options_on_to_the_lab() -> None:
@@ -375,13 +250,6 @@ def test_version_names_what_a_bug_report_needs() -> None:
     assert body["zsched"] == __version__
     assert {"wire", "zenoh", "python"} < set(body)
     assert run("version").stdout.splitlines()[0] == f"zsched {__version__}"
-
-
-@pytest.mark.parametrize("arguments", [("fly",), ("status", "--jsn"), ("demo", "--mode", "guess")])
-def test_wrong_usage_exits_with_2_and_explains_on_stderr(arguments: tuple[str, ...]) -> None:
-    result = run(*arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert arguments[-1] in result.stderr, "it names what is wrong"
 
 
 @pytest.mark.parametrize("verb", ["up", "init", "status", "tune", "stream", "check", "demo", "version"])
@@ -410,25 +278,6 @@ def test_the_manual_names_every_field_of_the_status() -> None:
     (row,) = [line for line in manual.splitlines() if "`zsched.status/1`" in line]
     fields = json.loads((RECORDED / "healthy.json").read_text()).keys() - {"schema"} | {"degraded"}
     assert fields == set(row.split("|")[3].strip(" `").split())
-
-
-def test_on_a_terminal_the_rules_of_a_file_wrap_at_its_width(screen: int) -> None:
-    file = REPOSITORY / "configs" / "fleet.yaml"
-    lines = run("check", file, "-v").stdout.splitlines()
-    assert max(map(len, lines)) <= screen
-    assert any(line.startswith("    ") for line in lines), "none was long enough to wrap"
-
-
-def test_what_a_ping_found_wraps_between_words_and_leaves_an_address_whole(
-    screen: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    endpoint = "tls/robot1.hall.example.org:7457"
-    found = Pinged(opened_s=0.05, round_trips_s=[0.0011, 0.0012])
-    for line in _lines("robot1", [Way(name="control", endpoint=endpoint, found=found)], {}):
-        say(line)
-    lines = capsys.readouterr().out.splitlines()
-    assert (len(lines), max(map(len, lines)) <= screen) == (2, True)
-    assert endpoint in lines[0]
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,7 @@ from typer.testing import CliRunner, Result
 from support.schemas import faults
 from support.waiting import until, within
 from zsched.cli import app
-from zsched.commands.base.common import CliError
-from zsched.commands.look.wait import Condition, missing, parse_condition
+from zsched.commands.look.wait import missing, parse_condition
 from zsched.host.operator_socket import OperatorSocket
 
 RECORDED = Path(__file__).parent / "recorded_status"
@@ -35,35 +34,6 @@ def lacks(text: str, *statuses: Json) -> list[str]:
 
 
 # --- conditions ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("healthy", Condition(kind="healthy")),
-        ("quorum", Condition(kind="quorum")),
-        ("owner=echo@edge1", Condition(kind="owner", task="echo", node="edge1")),
-        ("settled=echo", Condition(kind="settled", task="echo")),
-        ("empty=edge1", Condition(kind="empty", node="edge1")),
-    ],
-)
-def test_conditions_are_read(text: str, expected: Condition) -> None:
-    assert parse_condition(text) == expected
-
-
-@pytest.mark.parametrize("text", ["", "helthy", "healthy=echo", "owner=echo", "owner=@edge1", "settled=", "empty=a@b"])
-def test_what_is_no_condition_is_refused_with_those_there_are(text: str) -> None:
-    with pytest.raises(CliError, match="there are healthy, quorum, owner=TASK@NODE") as raised:
-        parse_condition(text)
-    assert raised.value.code == 2
-
-
-def test_healthy_lacks_every_problem() -> None:
-    assert lacks("healthy", recorded()) == []
-    assert lacks("healthy", recorded("degraded"))[0].startswith("no quorum")
-    status = recorded()
-    status["tasks"][0]["problems"] = ["the worker on edge2 failed"]
-    assert lacks("healthy", status) == ["echo: the worker on edge2 failed"]
 
 
 def test_quorum_and_owner() -> None:
@@ -184,17 +154,6 @@ def test_a_robot_that_does_not_know_a_new_task_yet_is_asked_until_it_does(daemon
     assert (late.exit_code, late.stdout.splitlines()[1:]) == (5, ["  echo: robot2 has not learnt of it yet"])
     daemon.behind = 1
     assert (run("--for", "settled=echo", "--timeout", "60").exit_code, daemon.behind) == (0, 0)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [("owner=ecko@edge1", "did you mean echo?"), ("empty=egde1", "did you mean edge1?"), ("soon", "is no condition")],
-)
-def test_what_there_is_not_is_a_usage_error_at_once(daemon: Daemon, text: str, says: str) -> None:
-    result = run("--for", text, "--timeout", "60")
-    assert result.exit_code == 2
-    assert says in result.stderr
-    assert len(daemon.asked) <= 1
 
 
 def test_nobody_at_the_end_exits_with_3(folder: Path) -> None:
