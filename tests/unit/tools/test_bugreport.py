@@ -12,7 +12,6 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from support.clinic import FLEET, fleet_scene
-from support.schemas import faults
 from zsched.cli import app
 from zsched.host.decision_log import NAME, OLD_NAME
 from zsched.tools.bugreport import gathered
@@ -109,17 +108,3 @@ def test_the_file_is_its_user_s_only_and_is_never_overwritten(place: Path) -> No
     again = run("report.tar.gz")
     assert (again.exit_code, again.stdout) == (1, "")
     assert "is there already" in again.stderr
-
-
-def test_without_a_name_it_is_called_by_node_and_time(place: Path) -> None:
-    body = json.loads(run("--json").stdout)
-    assert body["schema"] == "zsched.bugreport/1"
-    assert faults(body) == []
-    (file,) = place.glob("zsched-bugreport-robot1-*.tar.gz")
-    assert (body["file"], body["members"]["fleet.yaml"] > 0) == (file.name, True)
-
-
-def test_a_folder_that_is_not_there_is_told(place: Path) -> None:
-    result = run(str(place / "none" / "report.tar.gz"))
-    assert result.exit_code == 1
-    assert "cannot be written: No such file or directory" in result.stderr

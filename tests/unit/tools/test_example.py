@@ -34,12 +34,6 @@ def test_every_folder_of_examples_is_offered() -> None:
     assert {path.name for path in EXAMPLES.iterdir() if path.name != "__pycache__"} == {one.value for one in Example}
 
 
-def test_the_current_folder_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert run("new", "zenoh").exit_code == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == NAMES
-
-
 @pytest.mark.parametrize("is_link", [False, True])
 def test_what_is_there_is_named_and_nothing_is_written(tmp_path: Path, is_link: bool) -> None:
     if is_link:
@@ -51,13 +45,6 @@ def test_what_is_there_is_named_and_nothing_is_written(tmp_path: Path, is_link: 
     assert "has worker.py already" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["worker.py"]
     assert is_link or (tmp_path / "worker.py").read_text() == "mine"
-
-
-def test_a_folder_that_cannot_be_written_is_an_error_with_a_sentence(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    result = run("new", "python", tmp_path / "file" / "task")
-    assert result.exit_code == 1
-    assert "cannot write" in result.stderr
 
 
 def test_the_application_is_the_same_for_both_zenoh_workers() -> None:

@@ -89,17 +89,6 @@ def test_what_is_left_names_the_authoritys_key_that_a_fleet_needs(tmp_path: Path
     assert "to /root/.local/share/zsched/authority/field on another node, and enable zsched-renew.timer there" in said
 
 
-def test_a_plan_lists_what_stays_too(prefix: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    authority = tmp_path / "data/zsched/authority/field"
-    authority.mkdir(parents=True)
-    (authority / "authority.json").touch()
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr("zsched.tools.install.HIDDEN", ())
-    said = run("uninstall", Path("/"), "--plan").output
-    assert f"{prefix}, and the users zsched, zsched-worker;" in said
-    assert f"what is left: {authority}, the authority of fleet field" in said
-
-
 def test_uninstall_says_first_that_the_machine_is_still_a_node(prefix: Path, root: Path) -> None:
     assert prefix.exists()
     run("install", root)
@@ -205,15 +194,6 @@ def test_what_is_not_zscheds_is_left_alone_and_stops_install_before_it_writes(pr
     result = run("uninstall", root)
     assert (result.exit_code, files_in(root)) == (0, {"usr/local/bin/zsched"})
     assert f"left {stranger}: not zsched's" in result.output
-
-
-def test_without_an_installation_it_says_how_one_is_made(
-    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "prefix", str(tmp_path / "nowhere"))
-    result = run("install", root)
-    assert result.exit_code == 1
-    assert "pip install . makes one" in result.output
 
 
 def test_an_environment_whose_python_is_a_link_in_a_home_is_no_place_for_a_service(

@@ -52,21 +52,6 @@ def test_names_and_kinds_are_by_convention() -> None:
         assert not name.endswith(("_mb", "_s", "_ms"))
 
 
-def test_figures_are_the_status_s() -> None:
-    status = recorded()
-    status["tasks"][0]["epoch"] = (1 << 32) + 1
-    text = metrics_text(status)
-    assert values(text, "zsched_task_owner") == {("echo", "edge1"): 1, ("echo", "edge2"): 0}
-    assert values(text, "zsched_task_epoch") == {("echo",): (1 << 32) + 1}, "a gauge: a new generation sets it anew"
-    assert 'zsched_task_epoch{task="echo"} 4294967297\n' in text
-    memory = status["nodes"][0]["memory_mb"]
-    assert values(text, "zsched_node_memory_bytes")[("edge1",)] == memory * 1024 * 1024
-    assert values(text, "zsched_node_state")[("edge1", "alive")] == 1
-    assert values(text, "zsched_node_state")[("edge1", "gone")] == 0
-    assert values(text, "zsched_stream_messages_total")[("echo", "in/0")] == 150
-    assert values(text, "zsched_up") == {(): 1}
-
-
 @pytest.mark.parametrize(
     ("state", "is_told"), [("alive", True), ("suspect", True), ("gone", False), ("unknown", False)]
 )
@@ -99,14 +84,6 @@ def test_a_task_that_no_other_candidate_could_take_is_told() -> None:
     assert values(metrics_text(status), "zsched_task_without_spare") == {("echo",): 1}
     del status["tasks"][0]["problem_kinds"]
     assert values(metrics_text(status), "zsched_task_without_spare") == {}, "an older daemon does not tell"
-
-
-def test_degraded_is_told_and_what_is_not_measured_is_left_out() -> None:
-    status = recorded("degraded")
-    text = metrics_text(status)
-    assert (values(text, "zsched_degraded"), values(text, "zsched_quorum_ok")) == ({(): 1}, {(): 0})
-    assert ("robot2",) not in values(text, "zsched_node_cpu_used_cores"), "it has not measured it"
-    assert "None" not in text
 
 
 def test_names_of_others_cannot_break_a_line() -> None:
@@ -178,19 +155,6 @@ def test_who_is_interrupted_while_it_writes_leaves_the_new_file_and_no_other(
     result = CliRunner().invoke(app, ["metrics", "write", str(file)])
     assert (result.exit_code, file.read_text()) == (3, down_text())
     assert [path.name for path in folder.iterdir()] == ["zsched.prom"]
-
-
-def test_a_place_that_cannot_be_written_is_said(folder: Path) -> None:
-    result = CliRunner().invoke(app, ["metrics", "write", str(folder / "none" / "zsched.prom")])
-    assert result.exit_code == 1
-    assert "cannot be written: No such file or directory" in result.stderr
-
-
-def test_gauges_are_told_by_name() -> None:
-    status = recorded()
-    node = status["nodes"][0]
-    node["gauges"] = {"battery": 0.8}
-    assert values(metrics_text(status), "zsched_node_gauge") == {(node["name"], "battery"): 0.8}
 
 
 def told_names() -> set[str]:

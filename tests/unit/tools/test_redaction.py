@@ -106,27 +106,6 @@ def test_what_stands_behind_an_option_with_its_value_is_no_secret() -> None:
     assert secrets_of(check_bytes(text.encode()).fleet) == ("abcd1234",)
 
 
-def test_a_fleet_file_with_faults_loses_them_too() -> None:
-    text = clean_yaml(WITH_SECRETS.replace("kind: edge,", "kind: ege,").replace("--api-key, abcd1234, ", ""))
-    assert leaks(text) == []
-
-
-def test_a_flow_mapping_loses_them() -> None:
-    text = clean_yaml("worker: {env: {API_TOKEN: swordfish, MODE: fast, 'DB_PASSWORD': 'hunter22'}, ready: token}")
-    assert leaks(text) == []
-    assert "MODE: fast" in text
-    assert "ready: token" in text
-
-
-@pytest.mark.parametrize(
-    "line",
-    ["login with password=swordfish failed", "run --token=swordfish now", "GET https://me:swordfish@host/x"],
-)
-def test_a_log_line_loses_them(line: str) -> None:
-    assert leaks(clean(line)) == []
-    assert len(clean(line)) > len("REMOVED") + 4
-
-
 def test_a_zenoh_key_in_a_log_line_stays() -> None:
     line = "stream task=echo key=robot1/in epoch=3 API_KEY=swordfish"
     assert clean(line) == "stream task=echo key=robot1/in epoch=3 API_KEY=REMOVED"
@@ -137,9 +116,3 @@ def test_private_keys_go_and_known_values_go_everywhere() -> None:
     assert clean(pem) == "a\nREMOVED\nb"
     body = {"problems": ["worker said swordfish", "task=echo epoch=2"], "up_s": 3.5, "counters": {"tokens_seen": 5}}
     assert clean_json(body, ("swordfish",)) == {**body, "problems": ["worker said REMOVED", "task=echo epoch=2"]}
-
-
-def test_short_values_are_not_looked_for_everywhere() -> None:
-    fleet = check_bytes(WITH_SECRETS.encode()).fleet
-    assert set(secrets_of(fleet)) == {*SECRETS} - {"pw4url", "swordfish"}
-    assert secrets_of(None) == ()

@@ -9,11 +9,9 @@ from types import SimpleNamespace
 from typing import Any, Self
 
 import pytest
-from typer.testing import CliRunner
 
 from support.fleets import fleet_of, node_of
 from support.schemas import faults
-from zsched.cli import app
 from zsched.commands.base.ask import Door
 from zsched.commands.base.common import CliError
 from zsched.core.values.fleet import Cell, LocalSide
@@ -21,7 +19,7 @@ from zsched.core.values.in_force import InForce
 from zsched.link.bus.stream_tap import Tapped
 from zsched.runtime.access import StreamAccess
 from zsched.tools import stream as stream_verb
-from zsched.tools.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, rates, show_rates
+from zsched.tools.stream import KeyStats, StreamView, _print_rates, _print_sample, keys_for, show_rates
 
 
 def stream(name: str = "merge/in/0", messages: int = 10, size: int = 100, **more: Any) -> dict[str, Any]:
@@ -34,39 +32,6 @@ def status(*streams: dict[str, Any]) -> dict[str, Any]:
 
 
 OUT: dict[str, Any] = {"name": "merge/out/0", "from_expr": "edge1/merge/3/all", "to_expr": "robot1/all"}
-SRV: dict[str, Any] = {"name": "merge/srv/0", "from_expr": "robot1/now", "to_expr": "edge1/merge/now"}
-
-
-def test_rates_are_differences_over_the_time_between() -> None:
-    (found,) = rates(status(stream(messages=10, size=100)), status(stream(messages=30, size=4100)), 2.0)
-    assert (found["hz"], found["bytes_per_s"]) == (10.0, 2000.0)
-    assert (found["kind"], found["from"], found["to"]) == ("input", "robot1/map", "edge1/merge/robot1/map")
-    assert (found["owner"], found["epoch"]) == ("edge1", 3)
-
-
-@pytest.mark.parametrize("before", [status(), status(stream(messages=99))])
-def test_a_stream_that_is_new_or_began_anew_has_no_rate(before: dict[str, Any]) -> None:
-    (found,) = rates(before, status(stream(messages=30)), 1.0)
-    assert (found["hz"], found["bytes_per_s"]) == (None, None)
-
-
-def test_the_kind_of_a_stream_is_in_its_name() -> None:
-    found = rates(status(), status(stream(), stream(**OUT), stream(**SRV)), 1.0)
-    assert [one["kind"] for one in found] == ["input", "output", "service"]
-
-
-@pytest.mark.parametrize("word", ["merge/in/0", "in/0"])
-def test_a_stream_s_name_means_both_its_ends(word: str) -> None:
-    assert keys_for(status(stream(), stream(**OUT)), word) == ("robot1/map", "edge1/merge/robot1/map")
-
-
-def test_no_word_means_the_robot_s_own_keys() -> None:
-    assert keys_for(status(stream(), stream(**OUT), stream(**SRV)), None) == ("robot1/map", "robot1/all")
-
-
-@pytest.mark.parametrize("word", ["robot1/map", "**", "robot2/*/scan"])
-def test_any_other_word_is_a_key_expression(word: str) -> None:
-    assert keys_for(status(stream()), word) == (word,)
 
 
 @pytest.mark.parametrize(("word", "is_told"), [("nosuch", True), ("robot1/*", False), ("merge/in/7", True)])
@@ -77,16 +42,6 @@ def test_a_word_that_touches_no_stream_is_told_with_those_that_there_are(
     text = f"no stream here is called {word!r} or touches such a key (there are merge/in/0, merge/out/0): listening"
     told = capsys.readouterr().err
     assert told.startswith(text) if is_told else not told
-
-
-@pytest.mark.parametrize(
-    ("word", "code", "said"),
-    [("/map", 2, "no key expression"), ("srv/0", 2, "is a service"), ("a//b", 2, "empty chunk")],
-)
-def test_a_word_that_cannot_be_listened_to_is_refused(word: str, code: int, said: str) -> None:
-    with pytest.raises(CliError, match=said) as caught:
-        keys_for(status(stream(), stream(**SRV)), word)
-    assert caught.value.code == code
 
 
 def test_a_node_of_a_cell_is_no_place_to_listen_from_here() -> None:
@@ -115,12 +70,6 @@ def test_statistics_of_a_key() -> None:
     assert (found["min_bytes"], found["max_bytes"]) == (100, 300)
     assert found["min_gap_s"] == pytest.approx(0.1)
     assert found["max_gap_s"] == pytest.approx(0.5)
-
-
-def test_one_message_has_no_gap() -> None:
-    stats = KeyStats()
-    stats.add(5, 1.0)
-    assert (stats.as_json(1.0)["min_gap_s"], stats.as_json(1.0)["max_gap_s"]) == (None, None)
 
 
 def test_a_gap_of_one_key_counts_though_another_has_come_meanwhile(
@@ -197,26 +146,7 @@ def test_a_node_without_an_address_is_heard_through_this_one() -> None:
     assert (found["via"], found["endpoints"]) == ("robot1", ["tcp/127.0.0.1:9999"])
 
 
-def test_a_node_that_is_none_is_refused() -> None:
-    assert "there are edge1, robot1, robot2" in access("robot1").answer("robot9")["error"]
-
-
 # --- the verbs -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("verb", ["list", "hz", "bw", "tail"])
-def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    result = CliRunner().invoke(app, ["stream", verb, "--help"])
-    assert result.exit_code == 0
-    assert max(map(len, result.stdout.splitlines())) <= 80
-
-
-@pytest.mark.parametrize("verb", ["list", "hz", "bw", "tail"])
-def test_without_a_daemon_every_verb_exits_with_3(verb: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["stream", verb, "--runtime-dir", str(tmp_path)])
-    assert (result.exit_code, result.stdout) == (3, "")
-    assert f"stream {verb}: no daemon" in result.stderr
 
 
 def test_the_manual_shows_every_verb() -> None:

@@ -18,26 +18,11 @@ from zsched.commands.base.common import CliError
 from zsched.config.load import load_fleet
 from zsched.core.values.model import NodeId
 from zsched.host.latch import Latch
-from zsched.tools.dev.nodes import shares
-from zsched.tools.dev.run import LASTING_S, Lasting, Run, _of_a_worker, _parts
-from zsched.tools.dev.verb import DEFAULT_JOINS, ENTER, _commands, application, dev, entrance, json5
+from zsched.tools.dev.run import LASTING_S, Lasting, Run
+from zsched.tools.dev.verb import DEFAULT_JOINS, ENTER, _commands, application, entrance, json5
 from zsched.tools.dev.watch import Watched
 
 EXAMPLE = Path(__file__).parents[4] / "zsched" / "tools" / "examples" / "python" / "fleet.yaml"
-
-
-@pytest.mark.parametrize(
-    ("nodes", "cpus", "expected"),
-    [
-        ("ab", {0, 1}, {"a": {0}, "b": {1}}),
-        ("ab", {3, 5, 7, 8}, {"a": {3, 7}, "b": {5, 8}}),
-        ("abc", {0, 1}, {"a": {0}, "b": {1}, "c": {0}}),
-        ("ab", {0}, {}),
-        ("a", {0, 1}, {}),
-    ],
-)
-def test_each_cpu_is_one_node_s_as_far_as_they_go(nodes: str, cpus: set[int], expected: dict[str, set[int]]) -> None:
-    assert shares(list(nodes), cpus) == expected
 
 
 def test_a_saved_file_is_noticed_once_and_one_that_is_away_is_not(tmp_path: Path) -> None:
@@ -58,18 +43,6 @@ def test_a_saved_file_is_noticed_once_and_one_that_is_away_is_not(tmp_path: Path
     assert watched.changed() == {"sing": "other.py"}
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("2026-01-02 03:04:05,678 INFO zsched.worker.shout hello  you", ("INFO", "zsched.worker.shout", "hello  you")),
-        ("Traceback (most recent call last): of the", ("", "", "Traceback (most recent call last): of the")),
-        ("", ("", "", "")),
-    ],
-)
-def test_a_daemons_line_has_level_logger_and_text(line: str, expected: tuple[str, str, str]) -> None:
-    assert _parts(line) == expected
-
-
 def test_the_application_is_started_by_one_line_from_any_folder(tmp_path: Path) -> None:
     folder = tmp_path / "my task"
     folder.mkdir()
@@ -86,11 +59,6 @@ def test_the_application_is_started_by_one_line_from_any_folder(tmp_path: Path) 
         words = application(folder, worker, joins)
         assert words is not None
         assert shlex.split(words) == expected
-
-
-def test_a_folder_without_a_fleet_file_is_said(tmp_path: Path) -> None:
-    with pytest.raises(CliError, match=r"no fleet\.yaml in the folder .*zsched new python"):
-        dev(tmp_path)
 
 
 def test_a_worker_is_named_alone_or_with_its_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,21 +79,6 @@ def test_a_worker_is_named_alone_or_with_its_task(tmp_path: Path, monkeypatch: p
         assert error.value.code == 2
 
 
-def test_without_a_file_it_says_how_to_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("ZSCHED_CONFIG", str(tmp_path / "none.yaml"))
-    with pytest.raises(CliError, match="zsched new python") as told:
-        dev()
-    assert told.value.code == 78
-
-
-def test_a_faulty_file_is_told_as_check_tells_it(tmp_path: Path) -> None:
-    (tmp_path / "fleet.yaml").write_text("fleet: x\n")
-    result = CliRunner().invoke(app, ["dev", str(tmp_path / "fleet.yaml")])
-    assert result.exit_code == 78
-    assert "fleet.yaml:1:1" in result.stderr
-
-
 def test_a_fleet_without_tasks_has_nothing_to_run(tmp_path: Path) -> None:
     """`zsched fleet create` writes such a file, and `zsched check` only warns of it."""
     (tmp_path / "fleet.yaml").write_text("fleet: x\nnodes:\n  robot1: {kind: robot}\ntasks: {}\n")
@@ -141,24 +94,6 @@ def test_the_snippet_is_the_configuration_of_a_client() -> None:
     assert config.get_json("connect/endpoints") == '["tcp/127.0.0.1:7458"]'
     assert config.get_json("transport/shared_memory/enabled") == "false"  # some containers may lock no memory
     assert max(map(len, json5("tcp/127.0.0.1:65535").splitlines())) <= 76  # indented, on a terminal of 80 columns
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (
-            "worker_ended task=shout failures=1 restart_in_s=0.09 reason='exited with 1'",
-            "shout: its worker on edge1 has ended, failure 1: exited with 1; it is started again after 0.1 s",
-        ),
-        (
-            'worker_failed task=shout failures=3 reason="it\'s gone"',
-            "shout: its worker on edge1 has ended, failure 3: it's gone",
-        ),
-        ("a line of the worker", "edge1 | a line of the worker"),
-    ],
-)
-def test_what_becomes_of_a_worker_is_told_in_words(text: str, said: str) -> None:
-    assert _of_a_worker(NodeId("edge1"), text) == said
 
 
 class _Nodes:

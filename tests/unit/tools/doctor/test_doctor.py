@@ -11,9 +11,6 @@ from typer.testing import CliRunner, Result
 from support.clinic import FLEET
 from support.schemas import faults
 from zsched.cli import app
-from zsched.tools.doctor import model
-from zsched.tools.doctor import verb as doctor
-from zsched.tools.doctor.model import Check
 
 
 @pytest.fixture
@@ -55,26 +52,3 @@ def test_json_has_every_check_with_its_verdict() -> None:
     assert {"PASS", "SKIP", "FAIL"} <= {check["verdict"] for check in body["checks"]}
     assert all(check["fix"] for check in body["checks"] if check["verdict"] in ("WARN", "FAIL"))
     assert [check["evidence"] for check in body["checks"] if check["id"] == "fleet.pairs"] == [["no node answers"]]
-
-
-def test_a_faulty_fleet_file_is_a_failed_check_like_others(place: Path) -> None:
-    (place / "fleet.yaml").write_text("fleet: hall\n")
-    result = run()
-    assert result.exit_code == 1
-    assert "FAIL file.valid" in result.stdout
-
-
-@pytest.mark.usefixtures("place")
-@pytest.mark.parametrize(
-    ("found", "plain", "strict"),
-    [
-        (model.passed("fine"), 0, 0),
-        (model.skipped("not here"), 0, 0),
-        (model.warned("odd", fix="mend"), 0, 1),
-        (model.failed("broken", fix="mend"), 1, 1),
-    ],
-)
-def test_exit_codes(monkeypatch: pytest.MonkeyPatch, found: model.Result, plain: int, strict: int) -> None:
-    check = Check(name="arm.moves", asks="Does it move?", run=lambda _scene: found)
-    monkeypatch.setattr(doctor, "run_all", lambda _scene: [(check, found)])
-    assert (run().exit_code, run("--strict").exit_code) == (plain, strict)

@@ -18,7 +18,7 @@ from support.fleet_values import fleet_value_of
 from support.planted_faults import found_in
 from zsched import __version__
 from zsched.commands.base.places import Machine
-from zsched.config.load import check_file, load_fleet
+from zsched.config.load import load_fleet
 from zsched.core.values.codec import as_plain, document_hash
 from zsched.core.values.document import Document, Text
 from zsched.core.values.electorate import Elector, FleetValue
@@ -65,28 +65,6 @@ def test_a_planted_fault_is_found_by_every_check(check: Check) -> None:
     assert {check.name, function} & FOUND
 
 
-def test_a_check_that_is_only_mentioned_or_passes_counts_for_nothing(tmp_path: Path) -> None:
-    file = tmp_path / "test_some.py"
-    file.write_text(
-        """
-def test_one():
-    assert run("a.passes", scene).verdict is PASS
-    "a.mentioned"
-    assert_finds(inner.judged(run("a.within", scene)), FAIL)
-    assert_finds(run("a.direct", scene), FAIL, "a.word")
-    found = run("a.assigned", scene)
-    assert_finds(found, WARN)
-    check = room.function
-    assert_finds(check(scene), FAIL)
-    assert_finds(results["a.table"], FAIL)
-
-def helper():
-    assert_finds(run("a.helper", scene), FAIL)
-"""
-    )
-    assert found_in([file]) == {"inner.judged", "a.direct", "a.assigned", "room.function", "a.table"}
-
-
 # --- the fleet file --------------------------------------------------------------------------------------------------
 
 
@@ -95,15 +73,6 @@ def test_a_wrong_fleet_file_is_found_and_what_needs_it_is_skipped(tmp_path: Path
     results = {check.name: result for check, result in run_all(scene)}
     assert_finds(results["file.valid"], FAIL, "fleet.yaml:4:", "ege")
     assert results["state.valid"].verdict is results["worker.imports"].verdict is SKIP
-
-
-def test_a_fleet_file_that_is_not_there_has_no_line_and_a_way_to_begin(tmp_path: Path) -> None:
-    scene = scene_of(tmp_path)
-    scene.file.unlink()
-    result = run("file.valid", replace(scene, reading=check_file(scene.file)))
-    assert result.evidence == (f"{scene.file}: cannot be read: No such file or directory",)
-    for begin in ("zsched fleet create NAME", "zsched join INVITATION", "zsched new python"):
-        assert begin in result.fix
 
 
 def test_a_fleet_file_that_may_be_better_is_a_warning(tmp_path: Path) -> None:
@@ -453,11 +422,6 @@ def test_a_task_that_no_other_candidate_could_take_is_found(tmp_path: Path) -> N
     said = {"problems": [told], "problem_kinds": ["no_spare"]}
     assert_finds(run("task.owners", answer(scene, tasks=[{**task, **said}])), WARN, f"merge: {told}")
     assert run("task.owners", answer(scene, tasks=[{**task, **said, "problem_kinds": ["other"]}])).verdict is PASS
-
-
-def test_a_fleet_without_tasks_is_said_to_have_none(tmp_path: Path) -> None:
-    (told,) = run("task.owners", answer(scene_of(tmp_path), tasks=[])).evidence
-    assert told.startswith("no tasks; ")
 
 
 def test_an_input_that_nobody_publishes_is_found(tmp_path: Path) -> None:

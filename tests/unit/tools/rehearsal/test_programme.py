@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from zsched.core.route.gaps import GAP_WINDOW_S
 from zsched.core.values.rehearsal import Promised, Step
 from zsched.tools.rehearsal.programme import MIN_CALM_S, Action, Do, Lift, Look, Over, Programme, Sight, Wait
 
@@ -236,22 +235,3 @@ def test_the_gap_of_a_move_counts_though_the_status_was_away_when_it_ended() -> 
     played.after = told
     assert isinstance(played.play(), Over)
     assert played.programme.results[0].gaps[0].gap_s == 1.2
-
-
-def test_a_programme_that_is_over_stays_over() -> None:
-    played = fleet(Step.MOVE)
-    over = played.play()
-    assert isinstance(over, Over)
-    done = len(played.done)
-    assert [played.programme.advance(played.look) for _ in range(2)] == [over, over]
-    assert (len(played.done), len(played.programme.results)) == (done, 1)
-
-
-@pytest.mark.parametrize(("rounds", "calm_s", "steps"), [(0, 12.0, 1), (1, 1.0, 1), (1, 12.0, 0)])
-def test_a_programme_out_of_range_is_refused(rounds: int, calm_s: float, steps: int) -> None:
-    with pytest.raises(ValueError, match="expected steps, rounds from 1, a calm of 11 s or more"):
-        Programme([Step.MOVE][:steps], PROMISED, rounds=rounds, calm_s=calm_s, limit_s=30.0)
-
-
-def test_the_gap_of_one_step_is_never_the_usual_one_of_the_next() -> None:
-    assert MIN_CALM_S > GAP_WINDOW_S

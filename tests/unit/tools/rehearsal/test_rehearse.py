@@ -27,8 +27,7 @@ from zsched.core.values.struct import replace
 from zsched.host.operator_client import Json
 from zsched.tools.rehearsal import verb as rehearse
 from zsched.tools.rehearsal.programme import MIN_CALM_S, Do, Over, Programme
-from zsched.tools.rehearsal.report import table
-from zsched.tools.rehearsal.verb import RehearseOrder, Stage, parse_steps
+from zsched.tools.rehearsal.verb import RehearseOrder, Stage
 
 PROMISED = {
     "move": {"step": "move", "gap_s": 0.3, "decide_s": 1.0, "whole": ["echo/in/0"]},
@@ -91,17 +90,6 @@ def run(*words: str) -> Result:
 
 
 # --- words -----------------------------------------------------------------------------------------------------------
-
-
-def test_steps_keep_their_order() -> None:
-    assert parse_steps("worker, move") == (Step.WORKER, Step.MOVE)
-
-
-@pytest.mark.parametrize(("text", "says"), [("mvoe", "no step 'mvoe'; did you mean move?"), (" ,", "at least")])
-def test_a_word_that_is_no_step_is_refused(text: str, says: str) -> None:
-    with pytest.raises(CliError, match="--steps") as refused:
-        parse_steps(text)
-    assert says in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -412,50 +400,3 @@ def test_a_daemon_of_another_version_is_one_message_and_no_traceback(
     result = run("echo", "--steps", "worker", "--yes")
     assert (result.exit_code, type(result.exception)) == (EXIT_FAILED, SystemExit)
     assert "a daemon's answer cannot be read (unknown: a field that a later version has); update" in result.stderr
-
-
-# --- kept ones -------------------------------------------------------------------------------------------------------
-
-
-def test_kept_rehearsals_are_listed(daemon: Daemon) -> None:
-    assert run("--list").stdout == "robot1 has kept no rehearsal\n"
-    daemon.kept = {"20260101-000000-001": "{}", "20260102-000000-001": "{}"}
-    assert run("--list").stdout.split() == list(daemon.kept)
-    assert json.loads(run("--list", "--json").stdout)["names"] == list(daemon.kept)
-
-
-OUTCOME = {
-    "id": "20261125-141307-901",
-    "task": "shout",
-    "at": "2026-11-25T14:13:07.712Z",
-    "by": "ada@robot1",
-    "timing": "wifi",
-    "is_kept": True,
-    "way_back": "shout is on edge1 again, where it was",
-    "rows": [
-        {"step": "worker", "what": "gap", "where": "robot1 shout/out/0", "p50": 0.641, "max": 0.641, "n": 1}
-        | {"usual": 0.509, "promised": 21.48, "is_kept": True},
-        {"step": "move", "what": "lost", "where": "shout/in/0, shout/out/0, and more", "p50": 0, "max": 0, "n": 1}
-        | {"usual": None, "promised": 0.0, "is_kept": True},
-        {"step": "drain", "what": "left out", "where": "there is no document yet: " + "agree one " * 12, "p50": None}
-        | {"max": None, "n": 0, "usual": None, "promised": None, "is_kept": None},
-    ],
-}
-
-
-def test_an_outcome_fits_a_terminal_and_says_below_the_table_what_was_left_out_and_why() -> None:
-    lines = table(OUTCOME, 80).splitlines()
-    assert max(map(len, lines)) <= 80
-    rows = [line.split() for line in lines if line.startswith(("STEP", "worker ", "move "))]
-    assert [row[0] for row in rows] == ["STEP", "worker", "move"]
-    assert next(line for line in lines if line.startswith("worker ")).split()[2:4] == ["robot1", "shout/out/0"]
-    assert "shout/out/0, a…" in next(line for line in lines if line.startswith("move "))
-    (at,) = [number for number, line in enumerate(lines) if line.startswith("drain left out: there is no document")]
-    assert lines[at + 1].startswith("  ")
-    whole = table(OUTCOME, None).splitlines()
-    assert "shout/in/0, shout/out/0, and more" in whole[3], "nothing is cut where nobody looks"
-    assert len(whole) == 6
-
-
-def test_an_outcome_in_which_all_was_left_out_has_no_table() -> None:
-    assert "STEP" not in table({**OUTCOME, "rows": OUTCOME["rows"][-1:]}, 80)  # type: ignore[index]

@@ -30,9 +30,9 @@ from zsched.commands.base.common import CliError
 from zsched.core.values.errors import ConfigError
 from zsched.core.values.exits import EXIT_UNREACHABLE
 from zsched.host.operator_socket import OperatorSocket
-from zsched.tools.watch.feed import MOST_EVENTS, MOST_MOVES, POINTS, Feed, News, Past
+from zsched.tools.watch.feed import Feed, News, Past
 from zsched.tools.watch.screen import LEAVE
-from zsched.tools.watch.top import LEVELS, Frame, render_top
+from zsched.tools.watch.top import Frame, render_top
 
 RECORDED = Path(__file__).parent / "recorded"
 NOON = time.mktime((2026, 3, 4, 12, 0, 0, 0, 0, -1))
@@ -125,45 +125,6 @@ def test_no_screen_is_wider_or_higher_than_the_terminal(width: int, height: int)
             assert max(len(visible(line)) for line in lines) <= width
 
 
-def test_all_tasks_can_be_scrolled_to_where_they_have_no_room() -> None:
-    status = recorded()
-    status["tasks"] = [{**copy.deepcopy(status["tasks"][0]), "name": f"task{number}"} for number in range(20)]
-    past, seen = past_of(3, status), set()
-    for first in range(20):
-        lines = render_top(past, replace(SMALL, first_task=first))
-        seen |= {line.split()[0] for line in lines if line.startswith("task")}
-    assert seen == {f"task{number}" for number in range(20)}
-
-
-def bars(past: Past, node: str, frame: Frame = SMALL) -> str:
-    line = next(line for line in render_top(past, frame) if line.startswith(f" {node}"))
-    return "".join(char for char in line if char in LEVELS)
-
-
-def test_bars_rise_and_fall_with_the_utility_and_the_owner_is_marked() -> None:
-    past = past_of()
-    falling = bars(past, "edge1")
-    assert [LEVELS.index(char) for char in falling] == sorted((LEVELS.index(char) for char in falling), reverse=True)
-    assert set(bars(past, "edge2")) == {LEVELS[int(0.7 * 8)]}
-    assert len(falling) == 40, "a column a second"
-    assert any(line.startswith(" edge2* 0.700") for line in render_top(past, SMALL))
-    colored = next(
-        line for line in render_top(past, replace(SMALL, is_colored=True)) if "edge1" in line and "▇" in line
-    )
-    assert "\x1b[32m██▇" in colored, "as its owner"
-    assert "▂▁\x1b[0m" in colored.split("\x1b[2m")[1], "afterwards"
-
-
-def test_a_candidate_that_cannot_have_the_task_says_why() -> None:
-    status = recorded()
-    decision = status["tasks"][0]["decision"]
-    decision["vetoed"] = {"edge3": "reached by 0 of 3 robots"}
-    del decision["aggregates"]["edge3"]
-    past = Past()
-    past.take(News(at=NOON, status=status))
-    assert any(re.match(r" edge3 +- +reached by 0 of 3 robots", line) for line in render_top(past, SMALL))
-
-
 def test_a_daemon_that_went_away_is_said_below_its_last_figures() -> None:
     past = past_of()
     past.take(News(at=NOON + 5, status=None, why="no daemon there"))
@@ -175,57 +136,7 @@ def test_a_daemon_that_went_away_is_said_below_its_last_figures() -> None:
     assert render_top(nothing, SMALL)[0] == "no daemon"
 
 
-def test_an_edge_says_that_it_decides_nothing() -> None:
-    status = recorded()
-    for task in status["tasks"]:
-        task["decision"], task["streams"] = None, []
-    past = Past()
-    past.take(News(at=NOON, status=status))
-    assert sum("edges decide nothing" in line for line in render_top(past, SMALL)) == 2
-
-
 # --- what is kept ----------------------------------------------------------------------------------------------------
-
-
-def test_what_is_kept_is_bounded() -> None:
-    past, status = Past(), recorded()
-    for number in range(POINTS + 50):
-        entries = (
-            move(1.0, "echo", number, None, "edge1", "first"),
-            {**move(0.5, "x", 1, None, "y", ""), "took_s": 1.0},
-        )
-        past.take(News(at=NOON + number, status=status, entries=entries))
-    assert {len(points) for points in past.points.values()} == {POINTS}
-    assert len(past.events) == MOST_EVENTS
-    assert len(past.moves()) == MOST_MOVES
-
-
-def test_a_judgement_that_is_told_twice_is_one_point() -> None:
-    past, status = Past(), recorded()
-    for later in (0.0, 1.0, 2.0):
-        for task in status["tasks"]:
-            task["decision"]["age_s"] = 0.2 + later
-        past.take(News(at=NOON + later, status=status))
-    assert {len(points) for points in past.points.values()} == {1}
-
-
-def test_reasons_of_moves_are_whole_where_the_screen_has_room_and_cut_where_it_is_low() -> None:
-    past, low = past_of(), replace(SMALL, height=13)
-    high = replace(SMALL, height=40)
-    told = " ".join(" ".join(render_top(past, high)).split())
-    assert "edge2 leads by 0.2 over edge1 with its bonus; staying has cost 0.21 (43 ms)" in told
-    assert all(len(line) <= high.width for line in render_top(past, high))
-    assert "staying has cost 0.21" not in " ".join(render_top(past, low))
-    assert any("edge2 leads" in line and line.endswith("…") for line in render_top(past, replace(SMALL, height=20)))
-
-
-@pytest.mark.parametrize(("width", "height"), [(59, 24), (80, 11), (12, 6), (1, 1)])
-def test_a_window_that_is_too_small_says_so_within_its_size(width: int, height: int) -> None:
-    lines = render_top(past_of(), replace(SMALL, width=width, height=height))
-    assert len(lines) <= height
-    assert all(len(line) <= width for line in lines)
-    if width > 10:
-        assert "60 and 12 at least" in " ".join(lines)
 
 
 def test_without_a_log_the_moves_are_those_that_the_status_remembers() -> None:
@@ -406,8 +317,3 @@ def test_keys_that_come_at_once_count_each(tmp_path: Path) -> None:
         os.write(controller, b"\x1b[Bjq")
         assert shown_to_the_end(controller).endswith(LEAVE.encode())
         assert process.wait(60) == 0
-
-
-def test_nobody_there_is_said_at_once(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["top", "--once", "--runtime-dir", str(tmp_path)])
-    assert (result.exit_code, "no daemon in" in result.stderr) == (3, True)
