@@ -49,71 +49,10 @@ def with_(old: str, new: str, text: str = TEXT) -> str:
     return text.replace(old, new, 1)
 
 
-def test_the_same_file_and_other_comments_are_no_change() -> None:
-    assert changes(TEXT) == ()
-    assert changes(with_("# A zsched fleet file.", "# The fleet file.")) == ()
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("price_s: 0.3}", "price_s: 0.30}", (f"{RULES}.price_s", "0.3", "0.30", "nothing notices")),
-        ("timing: wifi", "timing: {profile: wifi}", ("timing", "wifi", "{profile: wifi}", "nothing notices")),
-        ("price_s: 0.3}", "price_s: 4}", (f"{RULES}.price_s", "0.3", "4", "takes effect at once")),
-        (", price_s: 0.3}", "}", (f"{RULES}.price_s", "0.3", None, "nothing notices")),
-        (
-            "price_s: 0.3}",
-            "price_s: 0.3, reach: all}",
-            (f"{RULES}.reach", "majority", "all", "takes effect at once"),
-        ),
-        ("bonus: 0.05, ", "", (f"{RULES}.bonus", "0.05", None, "nothing notices")),
-        (
-            "--mode, estimate]",
-            "--mode, known]",
-            (
-                "tasks.map_merge.worker.command",
-                "[python, -m, zsched.tasks.map_merge, --mode, estimate]",
-                "[python, -m, zsched.tasks.map_merge, --mode, known]",
-                "workers of map_merge restart one after another",
-            ),
-        ),
-        (
-            "class: latest, keep_last: 1}",
-            "class: latest, keep_last: 3}",
-            ("tasks.map_merge.inputs[0].keep_last", "1", "3", "the streams map_merge/in/0 move"),
-        ),
-        (
-            "host: 192.0.2.11 ",
-            "host: 192.0.2.13 ",
-            (
-                "nodes.edge1.host",
-                "192.0.2.11",
-                "192.0.2.13",
-                "the others dial edge1 there once it is gone from where it was",
-            ),
-        ),
-        (
-            "  robot3: {kind: robot, wifi: wlan0}\n",
-            "  robot3: {kind: robot, wifi: wlan0}\n  edge3: {kind: edge}\n",
-            ("nodes.edge3", None, "{kind: edge}", "edge3 may join: start its daemon"),
-        ),
-    ],
-)
-def test_one_place_is_one_change_with_what_follows(old: str, new: str, expected: tuple[str | None, ...]) -> None:
-    assert expected in told(with_(old, new))
-
-
 def test_what_follows_from_another_place_is_a_change_of_its_own() -> None:
     """A third edge is a candidate of a task that takes every edge; no line of the task says so."""
     text = with_("  robot3:", "  edge3: {kind: edge}\n  robot3:")
     assert ("tasks.map_merge.candidates", "edge1, edge2", "edge1, edge2, edge3", "takes effect at once") in told(text)
-
-
-def test_an_owner_that_is_no_candidate_any_more_is_left() -> None:
-    text = with_("candidates: {kind: edge}", "candidates: [edge2]")
-    row = ("tasks.map_merge.candidates", "{kind: edge}", "[edge2]")
-    assert told(text, map_merge="edge1") == [(*row, "map_merge leaves edge1: its streams move")]
-    assert told(text, map_merge="edge2") == [(*row, "takes effect at once")]
 
 
 def test_an_owner_to_which_the_task_is_pinned_hard_keeps_it() -> None:

@@ -19,7 +19,6 @@ tasks:
     worker: WORKER
     inputs: [{from: "{robot}/a", to: "{target}/{robot}/a"}]
 """
-PROGRAM = ("python", "-m", "zsched.drivers.systemd")
 
 
 def check(worker: str) -> CheckResult:
@@ -30,12 +29,6 @@ def worker_of(text: str) -> WorkerSpec:
     result = check(text)
     assert result.fleet is not None, result.report()
     return result.fleet.tasks[0].worker
-
-
-def test_a_unit_is_a_command_of_the_drivers_program() -> None:
-    worker = worker_of("{driver: systemd, unit: shout@.service, env: {B: c, A: d}, standby: cold}")
-    assert worker.command == (*PROGRAM, "--unit", "shout@.service", "--env", "B", "--env", "A")
-    assert worker.env == (("A", "d"), ("B", "c"))
 
 
 def test_an_image_with_its_words_is_a_command_of_the_drivers_program() -> None:
@@ -56,11 +49,6 @@ def test_an_image_with_its_words_is_a_command_of_the_drivers_program() -> None:
     )
     named = worker_of("{driver: container, image: a, engine: docker, env: {A: b}}").command
     assert named[3:] == ("--image=a", "--engine=docker", "--env", "A")
-
-
-def test_without_a_driver_the_command_is_the_operators() -> None:
-    assert worker_of("{command: [a, b]}") == worker_of("{driver: process, command: [a, b]}")
-    assert worker_of("{ready: matching}").command == ()
 
 
 @pytest.mark.parametrize(

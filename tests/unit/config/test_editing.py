@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from pathlib import Path
 
 import pytest
@@ -42,12 +41,6 @@ def lines_of(old: str, new: str) -> tuple[list[str], list[str]]:
     """(lines that came, lines that went)."""
     told = list(difflib.ndiff(old.splitlines(), new.splitlines()))
     return [line[2:] for line in told if line[0] == "+"], [line[2:] for line in told if line[0] == "-"]
-
-
-def test_a_task_is_added_to_an_empty_section_of_json() -> None:
-    text = '{"fleet": "hall",\n "tasks": {},\n "nodes": {"r1": {"kind": "robot"}}}\n'
-    added = add_entries(text, "tasks", "tasks: {count: {candidates: [r1], weights: {cpu: 1}}}")
-    assert added == text.replace("{}", "{count: {candidates: [r1], weights: {cpu: 1}}}")
 
 
 def test_tasks_are_added_with_their_comments_and_nothing_else_changes() -> None:
@@ -133,31 +126,6 @@ def test_a_node_leaves_its_section_the_lists_and_the_links() -> None:
     )
 
 
-def test_a_node_that_is_added_is_part_of_the_fleet() -> None:
-    text = add_entries(ANNOTATED, "nodes", "nodes:\n  robot4: {kind: robot, wifi: wlan0}\n")
-    assert lines_of(ANNOTATED, text) == (["  robot4: {kind: robot, wifi: wlan0}"], [])
-    assert "robot4" in fleet_of(text).voters
-    assert remove_node(text, "robot4") == ANNOTATED
-
-
-@pytest.mark.parametrize(
-    ("fragment", "words"),
-    [
-        ("tasks: {map_merge: {}}", "tasks has map_merge already"),
-        ("nodes: {e9: {}}", "expected the one key 'tasks'"),
-        ("tasks: {a: {}}\nnodes: {}", "expected the one key 'tasks'"),
-        ("tasks: {}", "expected the one key 'tasks'"),
-        ("- a", "expected the one key 'tasks'"),
-        ("tasks: {a: [", "new.yaml:1:"),
-        ("", "new.yaml: error: the file is empty"),
-    ],
-)
-def test_a_fragment_that_is_none_is_refused_by_its_name(fragment: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(words)) as caught:
-        add_entries(ANNOTATED, "tasks", fragment, "new.yaml")
-    assert "new.yaml" in str(caught.value)
-
-
 def test_what_cannot_be_spliced_is_refused_with_what_to_do() -> None:
     text = "tasks:\n  t: &one {a: 1}\n  u: *one\n"
     with pytest.raises(ConfigError, match=r"tasks\.t cannot be removed .* zsched edit"):
@@ -184,23 +152,6 @@ def test_every_entry_can_be_removed_and_the_others_keep_their_bytes(held: list[s
 
 
 # --- lists of names --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("seeds: [a]  # who\nfleet: f\n", "seeds: [a, x, y]  # who\nfleet: f\n"),
-        (
-            "seeds:   # who\n  - a   # first\n\nfleet: f\n",
-            "seeds:   # who\n  - a   # first\n  - x\n  - y\n\nfleet: f\n",
-        ),
-        ("seeds: []\nfleet: f\n", "seeds: [x, y]\nfleet: f\n"),
-        ("fleet: f", "fleet: f\nseeds: [x, y]\n"),
-    ],
-)
-def test_names_are_added_to_the_end_of_a_list(text: str, wanted: str) -> None:
-    assert add_names(text, ("seeds",), ["x", "y"]) == wanted
-    assert is_list(wanted, ("seeds",))
 
 
 def test_names_are_added_to_the_candidates_of_a_task_only_where_they_are_a_list() -> None:

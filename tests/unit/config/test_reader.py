@@ -18,18 +18,6 @@ def test_a_text_that_is_read_again_is_not_parsed_again(monkeypatch: pytest.Monke
     assert not second.faults  # is no fault for the other
 
 
-@pytest.mark.parametrize("text", [b"a: [1", b"", b"{{a: 1}: 2}"])
-def test_a_faulty_text_tells_its_faults_each_time(text: bytes) -> None:
-    told = [read_yaml(text)[1].faults for _ in range(2)]
-    assert told[0]
-    assert told[0] == told[1]
-
-
-def test_a_long_text_is_not_kept() -> None:
-    text = b"".join(b"key%d: value\n" % number for number in range(2000))
-    assert read_yaml(text)[0] is not read_yaml(text)[0]
-
-
 def test_a_stack_that_was_too_deep_for_a_text_says_nothing_of_the_text_later() -> None:
     text = b"a: {b: {c: [1, {d: [2]}]}}  # read from far down"
 

@@ -72,12 +72,6 @@ def test_names_become_rules_with_every_setting() -> None:
     assert routes[2].service.timeout_s == 3
 
 
-def test_ros_entries_stand_behind_plain_rules() -> None:
-    plain = 'inputs: [{from: "{robot}/scan", to: "{target}/merge/{robot}/scan"}]\n    '
-    names = [route.from_expr for route in routes_for(fleet_of(plain + TOPICS).tasks[0], "robot1", "edge1", 1)]
-    assert names[:2] == ["robot1/scan", f"0/robot1/map/{GRID}/*"]
-
-
 def test_domain_and_bridge_shape_the_keys() -> None:
     entry = '[{topic: "/{robot}/map", worker_topic: "/{target}/merge/{robot}/map"}]'
     (rmw,) = fleet_of(f"ros2: {{domain: 5, inputs: {entry}}}").tasks[0].rules
@@ -194,33 +188,6 @@ def test_an_action_of_any_type_and_one_of_a_bridge_have_keys() -> None:
     assert "the bridge's keys have none" in faults(f"ros2: {{bridge: ros2dds, actions: [{ACTION}]}}")
 
 
-@pytest.mark.parametrize(
-    ("entry", "said"),
-    [
-        ('{action: "/{robot}/spin", worker_action: "/spin"}', "'/spin': it lacks {target}"),
-        ('{action: "/{robot}/spin"}', "lacks the key 'worker_action'"),
-        ('{action: "/{robot}/spin", worker_action: "/{target}/s", type: a/action/B_SendGoal}', "PACKAGE/action/NAME"),
-        ('{action: "/{robot}/spin", worker_action: "/{target}/s", type: a/srv/B}', "PACKAGE/action/NAME"),
-        ('{action: "/{robot}/spin", worker_action: "/{target}/s", class: latest}', "has no key 'class'"),
-    ],
-)
-def test_a_fault_of_an_action_is_told_once(entry: str, said: str) -> None:
-    report = faults(f"ros2: {{actions: [{entry}]}}")
-    assert said in report
-    assert report.count("error:") == 1
-
-
-def test_an_output_from_a_plain_key_needs_type_and_hash() -> None:
-    report = faults('ros2: {outputs: [{topic: "/{robot}/m", worker_key: "{target}/m"}]}')
-    assert "a plain key has neither type nor hash" in report
-
-
-def test_a_bridge_has_no_types_and_no_domain() -> None:
-    entry = '{topic: "/{robot}/m", worker_key: "{target}/{robot}", hash: any}'
-    assert "the bridge's keys have none" in faults(f"ros2: {{bridge: ros2dds, inputs: [{entry}]}}")
-    assert "belongs to one" in faults("ros2: {bridge: ros2dds, domain: 1}")
-
-
 def test_node_names_must_be_fit_for_ros_names() -> None:
     text = FILE.replace("LOCAL", "").replace("robot2", "robot-2")
     entry = 'ros2: {inputs: [{topic: "/{robot}/m", worker_key: "{target}/{robot}"}]}'
@@ -243,21 +210,6 @@ def test_keys_that_become_one_are_warned_of() -> None:
     assert result.fleet is not None
     assert "several keys become one" in result.report()
     assert check(TOPICS).report() == ""
-
-
-@pytest.mark.parametrize(
-    ("local", "said"),
-    [
-        (", local: {mode: client}", "a client needs somebody to dial"),
-        (", local: {}", "a client needs somebody to dial"),
-        (", local: {mode: peer}", "it neither dials nor listens"),
-        (', local: {connect: ["tcp/127.0.0.1:7447"], listen: ["tcp/0.0.0.0:1"]}', "a client does not listen"),
-        (', local: {connect: ["tcp/127.0.0.1:7458"]}', "this node's own data session"),
-        (', local: {mode: peer, listen: ["tcp/0.0.0.0:7457"]}', "this node's own control session"),
-    ],
-)
-def test_a_local_side_must_lead_somewhere_else(local: str, said: str) -> None:
-    assert said in faults("drain_s: 1", local)
 
 
 def test_type_hashes_in_the_shipped_files_are_what_rosbags_computes() -> None:

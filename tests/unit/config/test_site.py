@@ -34,15 +34,6 @@ def test_cells_come_sorted_with_their_gateways_in_the_order_given() -> None:
     )
 
 
-def test_a_file_without_a_site_has_the_hash_that_it_had() -> None:
-    fleet, with_site = checked("").fleet, checked("site: {hall-b: {gateways: [tcp/192.0.2.31:7457]}}\n").fleet
-    assert fleet is not None
-    assert with_site is not None
-    assert fleet.cells == ()
-    assert fleet_hash(fleet) == "321a6503e05f4425"
-    assert fleet_hash(with_site) != fleet_hash(fleet)
-
-
 def test_the_folder_of_a_cells_file_is_each_machines_own(tmp_path: Path) -> None:
     site = "site: {hall-b: {gateways: [tls/192.0.2.31:7457, tls/192.0.2.32:7457], file: hall-b.yaml}}\n"
     (tmp_path / "hall-b.yaml").write_text("fleet: hall-b")
@@ -76,11 +67,3 @@ def test_what_is_refused_of_a_cell() -> None:
     ]
     assert faults("site: {hall-b: {gateways: []}}\n")
     assert faults("site: {hall-b: {}}\n")
-
-
-def test_a_cell_with_one_gateway_is_warned_of() -> None:
-    found = checked("site: {hall-b: {gateways: [tcp/192.0.2.31:7457]}}\n")
-    assert found.fleet is not None
-    assert "'hall-b' has one gateway: while that machine is away the cell cannot be asked" in [
-        one.message for one in found.warnings
-    ]
