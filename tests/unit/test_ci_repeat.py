@@ -39,21 +39,8 @@ def test_a_test_that_fails_again_fails_the_run(tmp_path: Path) -> None:
     assert "FLAKY: test_it.py::test_fails_the_first_time" in told
 
 
-def test_a_test_that_is_skipped_the_second_time_does_not_pass(tmp_path: Path) -> None:
-    skips = FLAKY.replace(
-        "    assert was_there", "    if was_there:\n        pytest.skip('gone')\n    assert was_there"
-    )
-    code, told = run(tmp_path, "import pytest\n" + skips)
-    assert code == 1
-    assert told.splitlines()[-1] == "FAILED twice: test_it.py::test_fails_the_first_time"
-
-
 def test_many_failures_are_not_repeated(tmp_path: Path) -> None:
     wrong = "".join(f"def test_{number}():\n    assert False\n\n" for number in range(13))
     code, told = run(tmp_path, wrong)
     assert code == 1
     assert "repeat" not in told
-
-
-def test_a_run_without_tests_keeps_its_exit_code(tmp_path: Path) -> None:
-    assert run(tmp_path, "")[0] == 5

@@ -29,13 +29,6 @@ def planned(folder: Path, *programs: str, target: str = "image", words: tuple[st
     return done.stdout
 
 
-@pytest.mark.parametrize(
-    ("programs", "engine"), [(("podman", "docker"), "podman"), (("podman",), "podman"), (("docker",), "docker")]
-)
-def test_the_image_is_built_by_what_there_is(tmp_path: Path, programs: tuple[str, ...], engine: str) -> None:
-    assert f"{engine} build" in planned(tmp_path, *programs)
-
-
 def test_a_share_of_the_long_tests_is_a_word_of_every_pytest(tmp_path: Path) -> None:
     """As `.ci/run` says it; without it `make test-all` runs all."""
     told = [planned(tmp_path, target="test-all", words=words) for words in ((), ("LONG=1/3",))]
@@ -43,11 +36,3 @@ def test_a_share_of_the_long_tests_is_a_word_of_every_pytest(tmp_path: Path) -> 
     assert [len(one) for one in lines] == [3, 3]
     assert not any("--long-share" in line for line in lines[0])
     assert all("--long-share=1/3" in line for line in lines[1])
-
-
-def test_a_wheel_of_before_does_not_come_into_the_image(tmp_path: Path) -> None:
-    """Of two wheels pip would have to install both."""
-    lines = planned(tmp_path, "docker").splitlines()
-    removed = next(number for number, line in enumerate(lines) if "rm -f dist/zsched-*.whl" in line)
-    built = next(number for number, line in enumerate(lines) if "package/wheel.py" in line)
-    assert removed < built

@@ -6,26 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from support.shares import left_out
-
 ROOT = Path(__file__).parents[2]
 FILES = [f"tests/{name}.py" for name in "hdbgfeac"]
-
-
-def test_each_file_is_in_one_share_and_shares_are_alike() -> None:
-    left = [left_out(FILES * 2, f"{own}/3") for own in range(3)]
-    assert [len(FILES) - len(one) for one in left] == [3, 3, 2]
-    assert all(sum(file not in one for one in left) == 1 for file in FILES)
-    assert left_out(FILES, "") == set()
-    assert left_out(FILES, "0/1") == set()
-
-
-@pytest.mark.parametrize("share", ["3/3", "1/0", "a", "1", "-1/3", " 0/3"])
-def test_what_is_no_share_is_refused(share: str) -> None:
-    with pytest.raises(ValueError, match="is no share of the long tests; say 0/3"):
-        left_out(FILES, share)
 
 
 def test_of_two_files_with_long_tests_a_share_of_two_leaves_those_of_one_out() -> None:

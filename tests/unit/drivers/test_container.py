@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from zsched.drivers import container
-from zsched.drivers.container import Container, files_named, look, why_it_ended
-from zsched.drivers.engine import Ended, Look, ask
+from zsched.drivers.container import Container, look
+from zsched.drivers.engine import Look, ask
 from zsched.drivers.place import Place
 
 IMAGE = "acme/merge:2"
@@ -19,33 +19,6 @@ IMAGE = "acme/merge:2"
 
 def test_examples_in_the_module_hold() -> None:
     assert doctest.testmod(container).failed == 0
-
-
-@pytest.mark.parametrize(
-    ("status", "reason", "is_final"),
-    [
-        (0, f"the container of {IMAGE} has ended or was stopped by somebody else: bye", False),
-        (3, f"the container of {IMAGE} failed with status 3: bye", False),
-        (78, f"the container of {IMAGE} failed with status 78: bye", True),
-        (125, f"a container of {IMAGE} was not started: bye", False),
-        (126, f"the command of {IMAGE} cannot be executed (status 126): bye", True),
-        (127, f"the command of {IMAGE} is not in the image (status 127): bye", True),
-        (137, f"the container of {IMAGE} was killed by signal 9: bye", False),
-        (255, f"the container of {IMAGE} failed with status 255: bye", False),
-    ],
-)
-def test_the_reason_names_the_status_and_the_last_words(status: int, reason: str, *, is_final: bool) -> None:
-    assert why_it_ended(IMAGE, status, is_oom=False, last_line="bye") == Ended(reason=reason, is_final=is_final)
-
-
-def test_a_container_without_memory_says_so() -> None:
-    end = why_it_ended(IMAGE, 137, is_oom=True, last_line="")
-    assert end == Ended(reason=f"the container of {IMAGE} was killed: out of memory")
-
-
-@pytest.mark.parametrize("session", ["", "no json", "[]", '{"transport": []}', '{"transport": {"link": {"tls": 3}}}'])
-def test_a_session_without_tls_names_no_files(session: str) -> None:
-    assert files_named(session) == []
 
 
 def place(folder: Path) -> Place:

@@ -7,48 +7,13 @@ import doctest
 import pytest
 
 from zsched.drivers import systemd
-from zsched.drivers.engine import Ended
-from zsched.drivers.systemd import judged, properties, quoted, unit_name, why_it_ended
+from zsched.drivers.systemd import judged
 
 UNIT = "shout.service"
 
 
 def test_examples_in_the_module_hold() -> None:
     assert doctest.testmod(systemd).failed == 0
-
-
-def test_only_a_template_gets_an_instance() -> None:
-    assert unit_name("a@.service", "edge1", "shout") == "a@edge1-shout.service"
-    assert unit_name("a@x.service", "edge1", "shout") == "a@x.service"
-
-
-@pytest.mark.parametrize(
-    ("value", "line"),
-    [("plain", 'A="plain"'), ('a "b"', 'A="a \\"b\\""'), ("$HOME `x` \\", 'A="\\$HOME \\`x\\` \\\\"'), ("", 'A=""')],
-)
-def test_a_variable_is_quoted_as_systemd_reads_it(value: str, line: str) -> None:
-    assert quoted("A", value) == line
-
-
-def shown(result: str, status: int, code: int = 1) -> dict[str, str]:
-    return properties(f"Result={result}\nExecMainStatus={status}\nExecMainCode={code}\nMainPID=0\n")
-
-
-@pytest.mark.parametrize(
-    ("properties_", "reason", "is_final"),
-    [
-        (shown("success", 0), f"{UNIT} has ended or was stopped by somebody else: bye", False),
-        (shown("exit-code", 3), f"{UNIT} failed with status 3 (exit-code): bye", False),
-        (shown("exit-code", 78), f"{UNIT} failed with status 78 (exit-code): bye", True),
-        (shown("oom-kill", 9, 2), f"{UNIT} was killed by signal 9 (oom-kill): bye", False),
-        (shown("core-dump", 11, 3), f"{UNIT} was killed by signal 11 (core-dump): bye", False),
-        (shown("signal", 78, 2), f"{UNIT} was killed by signal 78 (signal): bye", False),
-    ],
-)
-def test_the_reason_names_result_status_and_last_words(
-    properties_: dict[str, str], reason: str, *, is_final: bool
-) -> None:
-    assert why_it_ended(UNIT, properties_, "bye") == Ended(reason=reason, is_final=is_final)
 
 
 FILE = "edge1-shout.env"

@@ -193,13 +193,6 @@ def test_a_reader_whose_file_is_shorter_by_now_begins_with_what_is_left(tmp_path
     assert read_page(tmp_path, cursor) == ([], cursor, False)
 
 
-@pytest.mark.parametrize("offset", ["", "-1", "x", "9" * 5000, "\u00b2"])
-def test_a_place_that_is_none_begins_with_the_oldest_line(tmp_path: Path, offset: str) -> None:
-    Kept(tmp_path).write(story("one"))
-    first, cursor, _ = read_page(tmp_path, "")
-    assert read_page(tmp_path, f"{cursor.partition(':')[0]}:{offset}")[0] == first != []
-
-
 def test_a_page_read_while_the_newer_file_is_set_aside_leaves_nothing_out_and_tells_nothing_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,10 +243,6 @@ def test_operators_get_no_figures_and_moves_alone_where_they_ask_for_them(tmp_pa
     assert [line.by for line in kept.log.history("").lines] == ["", "", "ana.operator"]
     assert kept.log.answer({"cursor": everything["cursor"]})["entries"] == []
     assert kept.log.answer({"cursor": "1:nonsense"})["entries"] == everything["entries"]
-
-
-def test_a_log_that_is_not_there_is_empty(tmp_path: Path) -> None:
-    assert read_page(tmp_path, "") == ([], "", False)
 
 
 @pytest.mark.parametrize("size", [1, 50, 300])

@@ -40,13 +40,6 @@ def test_a_damaged_document_is_not_there(tmp_path: Path, at: int) -> None:
     assert store.load(document_hash(ONE)) == ONE
 
 
-def test_others_are_deleted(tmp_path: Path) -> None:
-    store = DocumentStore(tmp_path)
-    kept, gone = store.save(ONE), store.save(OTHER)
-    store.delete_others({kept})
-    assert (store.load(kept), store.load(gone)) == (ONE, None)
-
-
 def test_a_folder_that_cannot_be_written_is_an_error_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "documents").write_text("in the way")
     with pytest.raises(AdapterError, match=r"cannot write the fleet's document into .*/documents"):
@@ -69,8 +62,3 @@ def test_nothing_is_written_or_deleted_behind_a_link(tmp_path: Path) -> None:
     store.save(OTHER)
     assert (elsewhere / "theirs").read_text() == ""
     assert store.load(name) == ONE
-
-
-def test_a_hash_that_is_none_names_no_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="is not an id"):
-        DocumentStore(tmp_path).load("../state")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from zsched.host.files import owner_of, put_whole, read_packed, read_regular, write_regular
+from zsched.host.files import put_whole, read_packed, read_regular, write_regular
 
 TEXT = b"time_stamp,c_rssi\n" * 100
 
@@ -87,17 +87,6 @@ def test_a_file_has_its_mode_before_it_is_handed_over(tmp_path: Path) -> None:
     assert modes == [0o640]
 
 
-@pytest.mark.parametrize(
-    "packed", [gzip.compress(TEXT), gzip.compress(TEXT[:18]) + gzip.compress(TEXT[18:])], ids=["whole", "in parts"]
-)
-def test_a_packed_file_is_unpacked_every_part_of_it(tmp_path: Path, packed: bytes) -> None:
-    path = tmp_path / "file.gz"
-    path.write_bytes(packed)
-    assert read_packed(path, len(TEXT)) == TEXT
-    with pytest.raises(OSError, match="unpacked it holds more than 1 KiB"):
-        read_packed(path, 1024)
-
-
 def test_a_bomb_is_refused_before_it_bursts(tmp_path: Path) -> None:
     path = tmp_path / "bomb.gz"
     path.write_bytes(gzip.compress(bytes(64 << 20)))
@@ -108,22 +97,3 @@ def test_a_bomb_is_refused_before_it_bursts(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
-
-
-@pytest.mark.parametrize(
-    ("packed", "why"),
-    [(b"plain", "no gzip file"), (gzip.compress(TEXT)[:-9], "no whole"), (b"", "no whole")],
-    ids=["plain", "cut", "empty"],
-)
-def test_what_is_no_gzip_file_is_refused(tmp_path: Path, packed: bytes, why: str) -> None:
-    path = tmp_path / "file.gz"
-    path.write_bytes(packed)
-    with pytest.raises(OSError, match=why):
-        read_packed(path, 1 << 20)
-
-
-def test_whose_a_file_is_can_be_told(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.touch(0o600)
-    assert owner_of(path) == f"it belongs to user {os.getuid()} (mode 0600), this is user {os.geteuid()}"
-    assert "may not look" in owner_of(tmp_path / "nothing")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from zsched.host import heap
-from zsched.host.heap import GIVE_BACK_S, Leftovers, give_back, share_heaps
+from zsched.host.heap import GIVE_BACK_S, Leftovers, give_back
 from zsched.host.procfs import PAGE_MB
 
 
@@ -33,8 +33,3 @@ def test_what_a_running_process_frees_is_given_back_now_and_then(monkeypatch: py
     for now in (100.0, 101.0, 99.0 + GIVE_BACK_S, 100.0 + GIVE_BACK_S, 101.0 + GIVE_BACK_S, 200.0):
         leftovers.tend(now)
     assert times == [100.0, 100.0 + GIVE_BACK_S, 200.0]
-
-
-def test_heaps_may_be_shared_again_and_again() -> None:
-    share_heaps()
-    share_heaps()

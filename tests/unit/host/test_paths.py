@@ -8,17 +8,10 @@ from unittest.mock import patch
 
 import pytest
 
-from zsched.core.values.words import NAME
 from zsched.host import paths as places
 
 Find = Callable[[Path | None, Mapping[str, str]], Path]
 GIVEN = Path("/given")
-
-
-def test_fleet_file_argument_wins_over_the_environment() -> None:
-    env = {"ZSCHED_CONFIG": "/env/fleet.yaml"}
-    assert places.config_path(GIVEN, env) == GIVEN
-    assert places.config_path(None, env) == Path("/env/fleet.yaml")
 
 
 def test_fleet_file_of_the_user_is_taken_only_without_the_machines(
@@ -58,37 +51,6 @@ def test_folders_of_root_and_of_a_user(monkeypatch: pytest.MonkeyPatch) -> None:
     assert places.state_folder(None, env) == Path("/home/me/.local/state/zsched")
     assert places.runtime_folder(None, env) == Path("/run/user/1000/zsched")
     assert places.state_folder(None, {}).is_absolute()
-
-
-def test_only_sockets_are_listed_by_name(tmp_path: Path) -> None:
-    for name in ("robot2.sock", "edge1.sock", "edge1-merge.zenoh.json5"):
-        (tmp_path / name).touch()
-    assert places.local_sockets(tmp_path) == (tmp_path / "edge1.sock", tmp_path / "robot2.sock")
-    assert places.local_sockets(tmp_path / "none") == ()
-    assert places.socket_path(tmp_path, "edge1") in places.local_sockets(tmp_path)
-
-
-def test_name_argument_wins_over_the_environment_over_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("socket.gethostname", lambda: "host")
-    assert places.node_name("given", {"ZSCHED_NODE": "env"}) == "given"
-    assert places.node_name(None, {"ZSCHED_NODE": "env"}) == "env"
-    assert places.node_name(None, {"ZSCHED_NODE": ""}) == "host"
-
-
-@pytest.mark.parametrize(
-    ("host", "name"),
-    [
-        ("robot1", "robot1"),
-        ("Robot.1.local", "robot"),
-        ("Edge_2", "edge_2"),
-        ("mega drive", "mega-drive"),
-        ("-x-", "x"),
-    ],
-)
-def test_host_name_becomes_a_name_of_the_fleet_file(host: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("socket.gethostname", lambda: host)
-    assert places.node_name(None, {}) == name
-    assert NAME.fullmatch(name)
 
 
 def test_who_asks_finds_the_service_where_no_daemon_of_theirs_runs(tmp_path: Path) -> None:

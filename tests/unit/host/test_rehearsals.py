@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from zsched.core.values.errors import AdapterError
 from zsched.host.rehearsals import MAX_KEPT, RehearsalStore
 
 
@@ -18,17 +15,3 @@ def test_the_newest_are_kept_and_read_again(tmp_path: Path) -> None:
     assert len(store.names()) == MAX_KEPT
     assert store.names()[0] == "20260101-000003", "the oldest go"
     assert store.load(store.names()[-1]) == f'{{"n": {MAX_KEPT + 2}}}'
-
-
-@pytest.mark.parametrize("name", ["../state", "", "A b"])
-def test_a_name_is_no_path(tmp_path: Path, name: str) -> None:
-    store = RehearsalStore(tmp_path)
-    for call in (lambda: store.load(name), lambda: store.save(name, "{}")):
-        with pytest.raises(ValueError, match="rehearsal"):
-            call()
-
-
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    (tmp_path / "rehearsals").write_text("a file")
-    with pytest.raises(AdapterError, match="cannot keep the rehearsal in"):
-        RehearsalStore(tmp_path).save("1", "{}")

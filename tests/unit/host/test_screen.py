@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import json
 import os
 import pty
@@ -16,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from zsched.commands.base.common import print_json
-from zsched.host import screen
-from zsched.host.screen import fitted, harmless, wrapped
+from zsched.host.screen import harmless, wrapped
 
 WIDTH = 80
 SENTENCE = "zsched apply: nothing was changed, for " + "the fleet has another revision by now and " * 3
@@ -28,11 +26,6 @@ def test_a_sentence_is_broken_between_its_words() -> None:
     assert all(len(line) <= WIDTH for line in told.split("\n"))
     assert [line[:2] for line in told.split("\n")[1:]] == ["  "] * (len(told.split("\n")) - 1)
     assert told.split() == SENTENCE.split()
-
-
-def test_a_line_that_is_indented_goes_on_below_its_text() -> None:
-    first, second, *_ = wrapped(" " * 6 + SENTENCE, WIDTH).split("\n")
-    assert (len(first) - len(first.lstrip()), len(second) - len(second.lstrip())) == (6, 8)
 
 
 @pytest.mark.parametrize(
@@ -47,28 +40,6 @@ def test_a_command_stays_whole_for_it_is_copied(command: str) -> None:
     assert wrapped(command, WIDTH) == command
     quoted = f"`{command.strip()}`"
     assert quoted in wrapped(f"{SENTENCE}{quoted} does it", WIDTH).split("\n  ")
-
-
-def test_what_a_caret_points_into_stays_one_line() -> None:
-    place, source = "fleet.yaml:3:90: error: too long", f"    weights: {'{cpu: 0.1, ' * 10}"
-    near, far = (f"{' ' * columns}^~~~" for columns in (20, 90))
-    assert wrapped(f"{place}\n{source}\n{near}", WIDTH).split("\n") == [place, f"{source[:79]}…", near]
-    assert wrapped(f"{place}\n{source}\n{far}", WIDTH).split("\n") == [place, source, far]
-
-
-def test_off_a_terminal_a_line_stays_a_line() -> None:
-    assert fitted(SENTENCE, io.StringIO()) == SENTENCE
-    assert fitted("\x1b[31mred\x07", io.StringIO()) == "?[31mred?"
-
-
-def test_a_terminal_that_tells_no_width_has_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("COLUMNS", raising=False)
-    monkeypatch.setattr(screen, "is_screen", lambda _stream: True)
-    assert screen.screen_width(io.StringIO()) == 80
-    monkeypatch.setenv("COLUMNS", "wide")
-    assert screen.screen_width(io.StringIO()) == 80
-    monkeypatch.setenv("COLUMNS", "20")
-    assert screen.screen_width(io.StringIO()) == screen.MIN_WIDTH
 
 
 def shown_on_a_terminal(arguments: list[str], folder: Path) -> str:

@@ -27,18 +27,6 @@ def test_a_cut_seal_is_refused(length: int) -> None:
     assert caught.value.reason == "seal"
 
 
-@pytest.mark.parametrize("data", [b"\x02" + pack(SEAL)[1:], pack(SEAL) + b"x", TOO_LARGE])
-def test_a_foreign_seal_is_refused(data: bytes) -> None:
-    with pytest.raises(WireError) as caught:
-        unpack(data)
-    assert caught.value.reason == "seal"
-
-
-def test_a_seal_that_is_too_large_is_not_sent() -> None:
-    with pytest.raises(WireError, match="size"):
-        pack(Seal(life=0, sequence=0, signature=b"", certificate=b"c" * MAX_SEAL))
-
-
 def test_every_part_counts_and_none_passes_for_another() -> None:
     """Two messages that differ anywhere are signed differently, also where their parts run together."""
     base: dict[str, Any] = {"act": Act.PUT, "key": "ab", "frame": b"cd", "life": 1, "sequence": 2, "question": b"ef"}

@@ -98,21 +98,3 @@ def test_a_daemon_that_is_stopped_while_it_begins_anew_is_told_so_for_the_first_
     assert leaving.is_over((), (), told_at + 1.0 + LEAVE_S, finishing=OWNED), "its worker has no more time than that"
     assert not leaving.ask(OWNED, told_at + TWICE_S + 0.01)
     assert leaving.is_over(OWNED, OWNED, told_at + TWICE_S + 0.01), "now it was told twice"
-
-
-def test_what_is_left_behind_is_named() -> None:
-    leaving = asked()
-    assert leaving.last_words(OWNED, 103.0) == (
-        "leaves 2 tasks behind after 3.0 s (map, plan): nobody has taken over; "
-        "the robots move what they can once they miss this node"
-    )
-    assert "leaves 1 task behind" in leaving.last_words(OWNED[:1], 103.0)
-
-
-def test_whoever_asks_twice_does_not_wait() -> None:
-    leaving = asked()
-    assert not leaving.ask(OWNED, 100.0 + TWICE_S - 0.01)
-    assert not leaving.is_over(OWNED, OWNED, 100.0 + TWICE_S - 0.01), "one Ctrl-C that came by two ways"
-    assert not leaving.ask(OWNED, 100.01 + TWICE_S)
-    assert leaving.is_over(OWNED, OWNED, 100.01 + TWICE_S)
-    assert "told to stop twice" in leaving.last_words(OWNED, 100.3)

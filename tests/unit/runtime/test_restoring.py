@@ -65,12 +65,6 @@ def test_another_node_s_folder_is_left_as_it_is(tmp_path: Path, monkeypatch: pyt
     assert not (tmp_path / LIFE_NAME).exists()
 
 
-@pytest.mark.parametrize("text", ["", "x", "-3", "9" * 25, str(2**53), "12" * 40])
-def test_a_note_of_another_form_counts_as_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    (tmp_path / LIFE_NAME).write_text(text)
-    assert start(tmp_path, monkeypatch, 5000).incarnation == 5000
-
-
 def test_a_life_that_cannot_be_noted_is_lived_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

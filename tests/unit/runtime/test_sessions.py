@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from zsched.host.workers.comparison import OTHER_SETTINGS, lacking
 from zsched.link.sessions.config import worker_config
-from zsched.runtime.sessions import NAME, SessionsRead
+from zsched.runtime.sessions import SessionsRead
 
 ONE, TWO = "tcp/10.0.0.1:7458", "tcp/10.0.0.2:7458"
 
@@ -83,22 +82,3 @@ def test_another_boot_has_other_workers(machine: Machine) -> None:
     machine.boot.unlink()
     assert machine.daemon(session(ONE)).seen("merge", 0, is_new=False) == "", "no boot is told apart"
     assert machine.daemon(session(ONE, TWO)).seen("merge", 0, is_new=False) == ""
-
-
-@pytest.mark.parametrize(
-    "content",
-    ["", "{", "[]", "7", '{"boot": "1"}', '{"boot": "1", "workers": {"merge": 7}}', '{"boot": "1", "workers": []}'],
-)
-def test_a_damaged_file_is_as_good_as_none(machine: Machine, content: str) -> None:
-    (machine.folder / NAME).write_text(content)
-    assert machine.daemon(session(ONE)).seen("merge", 0, is_new=False) == ""
-    assert json.loads((machine.folder / NAME).read_text())["workers"].keys() == {"merge"}
-
-
-def test_a_folder_that_cannot_be_written_costs_only_the_hint(machine: Machine) -> None:
-    (machine.folder / NAME).mkdir()
-    assert machine.daemon(session(ONE)).seen("merge", 3, is_new=True) == ""
-
-
-def test_a_task_that_is_not_ours_says_nothing(machine: Machine) -> None:
-    assert machine.daemon(session(ONE)).seen("other", 0, is_new=False) == ""

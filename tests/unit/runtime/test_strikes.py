@@ -10,7 +10,7 @@ import pytest
 
 from support.fleets import fleet_of, node_of
 from zsched.core.values.fleet import Fleet
-from zsched.runtime.strikes import RESTARTED_BY, cut_rules, ports_of, unit_of, why_no_cut, why_no_restart
+from zsched.runtime.strikes import RESTARTED_BY, cut_rules, ports_of, why_no_cut, why_no_restart
 
 UNIT = "0::/system.slice/zsched.service\n"
 IN_SYSTEMD = {"INVOCATION_ID": "0a"}
@@ -57,18 +57,6 @@ def test_a_child_of_a_service_is_not_the_service(tmp_path: Path, systemctl: Path
     systemctl.write_text("Restart=always\nMainPID=8\n")
     said = "zsched.service is not this daemon (its main process is 8): nothing would start it again"
     assert why_no_restart(IN_SYSTEMD, 7, cgroup(tmp_path)) == said
-
-
-def test_a_service_that_cannot_be_asked_for_is_no_proof(tmp_path: Path, systemctl: Path) -> None:
-    systemctl.unlink(missing_ok=True)
-    said = why_no_restart(IN_SYSTEMD, 7, cgroup(tmp_path))
-    assert said.startswith("`systemctl show zsched.service` does not answer")
-
-
-def test_the_unit_is_the_innermost_service(tmp_path: Path) -> None:
-    text = "1:name=systemd:/user.slice/user-0.slice/user@0.service/app.slice/zsched.service\n"
-    assert unit_of(cgroup(tmp_path, text)) == "zsched.service"
-    assert unit_of(cgroup(tmp_path, "0::/\n")) == ""
 
 
 def apart() -> Fleet:

@@ -20,17 +20,6 @@ def test_an_unknown_placeholder_is_refused_with_those_that_there_are(template: s
         filled(template, "edge1/t", IN_OUTPUTS)
 
 
-def test_an_input_has_no_epoch() -> None:
-    with pytest.raises(ValueError, match=r"no placeholder \{epoch\} here; known: \{prefix\}$"):
-        filled("{prefix}/{epoch}/in", "edge1/t")
-
-
-@pytest.mark.parametrize("template", ["{prefix/out", "{prefix}/out}", "{prefix}/{{epoch}}/out"])
-def test_a_brace_that_is_not_closed_is_refused(template: str) -> None:
-    with pytest.raises(ValueError, match=r"brace is not closed|no placeholder"):
-        filled(template, "edge1/t", IN_OUTPUTS)
-
-
 @pytest.mark.parametrize(
     ("key", "is_taken"),
     [

@@ -20,8 +20,6 @@ from zsched.host.machine.device_profiler import (
     _ProcessTrees,
     parse_cpu_list,
     parse_cpu_stat,
-    parse_pressure,
-    parse_running,
 )
 from zsched.host.procfs import parse_process_stat, parse_schedstat
 from zsched_lab.fleet.groups import LimitedGroup
@@ -181,23 +179,6 @@ def test_on_some_of_the_cpus_or_under_a_quota_nobody_counts_who_else_wants_them(
         profiler = machine(root, **files)
         write(root, {"proc/stat": (root / "proc/stat").read_text() + RUNNING})
         assert profiler.sample({}).runnable is None
-
-
-def test_a_broken_count_of_who_runs_is_none() -> None:
-    assert parse_running(b"cpu 1\nprocs_running many\n") is None
-    assert parse_running(b"cpu 1\nprocs_running ") is None
-    assert parse_running(b"") is None
-
-
-def test_quota_wider_than_the_machine_is_no_limit(tmp_path: Path) -> None:
-    files = {
-        "proc/self/mountinfo": V2,
-        "proc/self/cgroup": "0::/a\n",
-        "sys/fs/cgroup/a/cpu.max": "800000 100000\n",
-        "sys/fs/cgroup/a/memory.max": str(2**50),
-    }
-    sample = machine(tmp_path, **files).sample({})
-    assert (sample.cpu_cores, sample.memory_mb) == (2.0, 4000.0)
 
 
 def test_unreadable_machine_gives_none_and_never_raises(tmp_path: Path) -> None:
@@ -426,11 +407,6 @@ def test_pressure_is_the_share_of_the_time_in_which_somebody_lacked_a_cpu(tmp_pa
     (tmp_path / "proc/pressure/cpu").unlink()
     clock.now += 1.0
     assert profiler.sample({}).cpu_pressure is None
-
-
-@pytest.mark.parametrize("text", [b"", b"full total=7\n", b"some avg10=1.00\n", b"some total=x\n", b"\xff\x00"])
-def test_what_is_no_pressure_is_not_measured(text: bytes) -> None:
-    assert parse_pressure(text) is None
 
 
 def used_s(process: psutil.Process) -> float:

@@ -19,7 +19,6 @@ from zsched.host.radio.network_profiler import (
     parse_wireless,
     readers_for,
     retry_ratio,
-    wireless_dbm,
 )
 from zsched.host.radio.nl80211 import GenericNetlink, Interface, Nl80211Error, Station
 
@@ -80,12 +79,6 @@ def test_wireless_file_is_read_by_interface(tmp_path: Path) -> None:
     assert problem_of(reader) is None
     assert parse_wireless(WIRELESS, "wlan9") is None
     assert parse_wireless("", "wlan0") is None
-
-
-def test_wireless_levels_are_dbm_or_not_measured() -> None:
-    levels = [parse_wireless(WIRELESS, name) for name in ("wlan0", "wlan1", "wlan2")]
-    assert levels == [-56.0, 200.0, 60.0]
-    assert [wireless_dbm(level) for level in levels if level is not None] == [-56.0, -56.0, None]
 
 
 def test_wifi_falls_back_to_the_wireless_file_and_says_so(tmp_path: Path) -> None:
@@ -229,13 +222,3 @@ def test_unusable_trace_is_a_reader_with_a_problem(tmp_path: Path, content: byte
     assert reader.problem is not None
     assert word in reader.problem
     assert str(path) in reader.problem
-
-
-def test_missing_trace_is_a_reader_with_a_problem(tmp_path: Path) -> None:
-    (reader,) = readers_for(node(LinkSpec(source=LinkSource.TRACE, value=str(tmp_path / "none.csv"))))
-    assert reader.read().rssi_dbm is None
-    assert reader.problem is not None
-
-
-def test_node_without_links_has_no_readers() -> None:
-    assert readers_for(node()) == ()

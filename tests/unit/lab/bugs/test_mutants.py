@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from zsched_lab.bugs.mutant_tests import KILLED, SURVIVED, TIMEOUT, UNJUDGED, Reach
+from zsched_lab.bugs.mutant_tests import KILLED, SURVIVED, TIMEOUT, UNJUDGED
 from zsched_lab.bugs.mutants import Mutant, mutants_of, mutated
-from zsched_lab.bugs.mutate import CORE, Fork, Results, Verdict, choose, score, table
+from zsched_lab.bugs.mutate import CORE, Fork, Results, Verdict, score, table
 
 ROOT = Path(__file__).parents[4]
 
@@ -86,16 +86,6 @@ def test_a_mutated_module_differs_in_one_thing_and_the_same_code_is_none() -> No
     assert mutated(unused, "1\n", "m.py") is None
 
 
-def test_a_seed_chooses_the_same_mutants_again_and_another_one_others() -> None:
-    first, again, other = choose(1, 20), choose(1, 20), choose(2, 20)
-    assert [one.key for one in first] == [one.key for one in again]
-    assert {one.key for one in first} != {one.key for one in other}
-    assert len({one.module for one in first}) > 5
-    assert {one.path for one in choose(3, 1000, ["core/scheduler/turns.py"])} == {"core/scheduler/turns.py"}
-    (line, *_) = choose(3, 1000, ["core/scheduler/turns.py"])
-    assert {one.line for one in choose(3, 1000, [f"core/scheduler/turns.py:{line.line}"])} == {line.line}
-
-
 def verdict(number: int, kind: str) -> Verdict:
     return Verdict(
         key=str(number), path="core/a.py", text=f"core/a.py:{number}", verdict=kind, found_by="", seconds=1.0
@@ -148,15 +138,6 @@ def test_a_change_of_one_function_leaves_the_keys_of_all_others_alone() -> None:
     keys = {one.key for one in mutants_of("m", before)}
     assert len(keys) == len(mutants_of("m", before))
     assert keys < {one.key for one in mutants_of("m", after)}
-
-
-def test_what_found_a_mutant_is_tried_first_at_the_next_one_of_its_function() -> None:
-    first, second = mutants_of("m", "def f(a):\n    return a < 1 and b\n")[:2]
-    reach = Reach(functions={"quick": ["m:f"], "slow": ["m:f"]}, seconds={"quick": 0.1, "slow": 2.0})
-    assert reach.chosen(first) == ["quick", "slow"]
-    reach.learn(first, "slow")
-    reach.learn(first, "seed 3: a violation")
-    assert reach.chosen(second) == ["slow", "quick"]
 
 
 def run(tmp_path: Path, tests: Path, *given: Mutant | str) -> str:

@@ -100,18 +100,6 @@ def test_only_data_has_small_buffers_and_shared_memory() -> None:
     assert read(off, "transport/shared_memory/enabled") is False
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "expected"),
-    [
-        ("tcp/[::]:1#iface=wlan0", "tcp/[::]:1#iface=wlan0;so_sndbuf=65536"),
-        ("tcp/[::]:1#so_sndbuf=9000", "tcp/[::]:1#so_sndbuf=9000"),
-        ("unixsock-stream/tmp/z", "unixsock-stream/tmp/z"),
-    ],
-)
-def test_an_endpoint_keeps_what_the_operator_said(endpoint: str, expected: str) -> None:
-    assert json.loads(data_config(listen=(endpoint,), connect=()))["listen"]["endpoints"] == [expected]
-
-
 def test_the_operators_file_lies_underneath() -> None:
     theirs = (
         "{ /* ours wins */ mode: 'router', transport: {link: {tx: {queue: {size: {data: 4}}}}}, namespace: 'site' }"
@@ -180,16 +168,3 @@ def test_an_introduction_keeps_the_operators_own_settings() -> None:
         listen=(HERE,), connect=(THERE,), operator_json5="{transport: {auth: {usrpwd: {user: 'u', password: 'p'}}}}"
     )
     assert read(introduction_config(session) or "", "transport/auth/usrpwd/user") == "u"
-
-
-@pytest.mark.parametrize(
-    "session",
-    [
-        ALL["client"],
-        data_config(listen=(HERE,), connect=(), timing=TIMING),
-        data_config(listen=(HERE,), connect=(THERE,), dials_by_gossip=False),
-    ],
-    ids=["a client", "dials nobody", "does not dial by gossip"],
-)
-def test_who_is_not_met_by_gossip_needs_no_introduction(session: str) -> None:
-    assert introduction_config(session) is None

@@ -35,11 +35,3 @@ def test_one_address_is_itself_and_all_are_those_of_the_kernel(tmp_path: Path) -
     assert told(tmp_path, ALL) == ["10.0.0.7", "127.0.0.1"]
     assert told(tmp_path, "::") == ["10.0.0.7", "127.0.0.1", "2001:4860::1"]
     assert told(tmp_path, "robot4.local") == []
-
-
-def test_without_the_tables_there_is_none(tmp_path: Path) -> None:
-    assert told(tmp_path, "::") == []
-
-
-def test_this_machine_has_its_loopback() -> None:
-    assert "127.0.0.1" in told(Path("/"), ALL)

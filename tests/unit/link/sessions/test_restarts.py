@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from support.fleets import fleet_of, node_of, task_of
+from support.fleets import fleet_of, node_of
 from zsched.core.values.fleet import Fleet, NodeSpec, Security, SharedMemory, Signatures
 from zsched.core.values.model import NodeKind
 from zsched.link.sessions.restarts import moved, opens_anew, restarts, waits_for
@@ -43,21 +43,6 @@ def test_what_holds_after_a_restart_only_is_told(new: Fleet, told: str) -> None:
     found = restarts(OLD, new, "robot1")
     assert len(found) == 1 or told == "named under `seeds`"
     assert any(told in sentence for sentence in found)
-
-
-@pytest.mark.parametrize(
-    "new",
-    [
-        OLD,
-        replace(OLD, tasks=(task_of("merge", ("edge1",)), task_of("other"))),
-        replace(OLD, timing=replace(OLD.timing, beat_s=0.1)),
-        replace(OLD, nodes=tuple(one for one in NODES if one.name != "edge2"), seeds=("edge1",)),
-        with_node(addressed("robot9", NodeKind.ROBOT)),
-    ],
-)
-def test_what_is_taken_over_is_not_told(new: Fleet) -> None:
-    small = replace(new, nodes=new.nodes) if new is not OLD else new
-    assert [one for one in restarts(OLD, small, "robot1") if "zenoh's pools" not in one] == []
 
 
 def test_a_node_that_comes_dials_those_that_are_named_as_seeds() -> None:
@@ -100,10 +85,6 @@ def test_a_daemon_that_begins_again_by_itself_asks_nobody_to_restart_it() -> Non
     assert waits_for((), True) is waits_for((), False) is None
     assert waits_for(("one", "two"), False) == "until this daemon is restarted: one; two"
     assert waits_for(("one",), True) == "until this daemon begins again, by itself in its turn: one"
-
-
-def test_agreed_electors_need_no_generation() -> None:
-    assert restarts(OLD, replace(OLD, electors=("robot1",)), "robot1", is_agreed=True) == ()
 
 
 def test_a_longer_lease_for_which_open_sessions_send_too_few_signs_of_life_needs_a_restart() -> None:

@@ -22,22 +22,6 @@ def fleet(control: str = "") -> Fleet:
 
 
 @pytest.mark.parametrize(
-    ("text", "control", "protocol"),
-    [
-        ("", "", "tcp"),
-        ("", PLAIN, "tcp"),
-        ("{scouting: {multicast: {enabled: false}}}", PLAIN, "tcp"),
-        (WHOLE, "", "tls"),
-        (WHOLE, PLAIN, "tls"),
-        (WHOLE, TLS, "tls"),
-        (WHOLE, "quic/0.0.0.0:7457", "tls"),
-    ],
-)
-def test_settings_of_tls_or_an_encrypted_endpoint_make_it(text: str, control: str, protocol: str) -> None:
-    assert protocol_of(fleet(control), text) == protocol
-
-
-@pytest.mark.parametrize(
     ("text", "control", "missing"),
     [
         ("", TLS, "listen_certificate and listen_private_key"),

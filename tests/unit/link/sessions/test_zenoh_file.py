@@ -22,7 +22,7 @@ from zsched.core.values.errors import ConfigError
 from zsched.core.values.exits import EXIT_CONFIG
 from zsched.core.values.fleet import Fleet, Security
 from zsched.link.sessions.access_rules import ALL
-from zsched.link.sessions.zenoh_file import denied_by, faults_of, judged, operator_json5
+from zsched.link.sessions.zenoh_file import denied_by, faults_of, judged
 
 FILE = "/etc/zsched/zenoh.json5"
 FLEET = """
@@ -86,33 +86,11 @@ def test_the_first_key_that_is_denied_is_named_and_whether_that_is_sure(text: st
     assert (found, [key in one.message for one in faults]) == (bool(is_sure), [] if is_sure is None else [True])
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "{}",
-        "{transport: {link: {tx: {queue: {size: {data: 4}}}}}}",
-        rules("@zsched/**"),
-        rules("**", "@zsched/hall/**"),
-        rules("elsewhere/**", permission="deny", default="allow"),
-        rules("@zsched/**", permission="deny", default="allow", usernames=["guest"]),
-    ],
-)
-def test_what_a_fleet_works_with_is_none(text: str) -> None:
-    assert (faults_of(fleet(), text), denied_by(fleet(), text)) == ((), (False, ()))
-
-
 def test_tls_or_rules_do_not_go_with_a_security_section() -> None:
     secured = replace(fleet(), security=Security(folder="/etc/zsched/pki"))
     for text in ('{transport: {link: {tls: {root_ca_certificate: "a"}}}}', rules("@zsched/**")):
         (fault,) = faults_of(secured, text)
         assert (fault.hint, fault.file) == ("keep one of them", FILE)
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"gone\.json5: cannot be read: No such file"):
-        operator_json5(replace(fleet(), zenoh_config=str(tmp_path / "gone.json5")))
-    assert operator_json5(replace(fleet(), zenoh_config="")) == ""
 
 
 def report(folder: Path, text: str) -> str:
@@ -135,14 +113,6 @@ def test_rules_that_may_allow_it_together_are_a_warning(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, ["check", str(tmp_path / "fleet.yaml")]).exit_code == 0
     report(tmp_path, rules("**"))
     assert CliRunner().invoke(app, ["check", str(tmp_path / "fleet.yaml")]).exit_code == EXIT_CONFIG
-
-
-def test_settings_that_are_not_used_are_named(tmp_path: Path) -> None:
-    ours = '{mode: "peer", listen: {endpoints: {router: ["tcp/[::]:7447"], peer: ["tcp/[::]:0"]}}}'
-    assert "is not used" not in report(tmp_path, ours), "as in zenoh's own example of a file"
-    said = report(tmp_path, '{listen: {endpoints: ["tcp/0.0.0.0:9"]}, transport: {link: {tx: {lease: 5}}}}')
-    assert "`listen/endpoints` is not used" in said
-    assert "`transport/link/tx/lease` is not used: `timing:`" in said
 
 
 def started(tmp_path: Path, text: str) -> subprocess.CompletedProcess[str]:

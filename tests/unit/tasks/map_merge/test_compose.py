@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -49,17 +48,6 @@ def test_strongest_cell_wins() -> None:
     assert merged.data.tolist() == [[0, 100, 100]]
 
 
-def test_values_out_of_range_are_read_as_unknown_and_certain() -> None:
-    extent = Extent(low_x=0, low_y=0, high_x=3, high_y=1)
-    assert compose([(_grid([[-128, 127, 50]]), Pose2())], extent, 0.05).data.tolist() == [[-1, 100, 50]]
-
-
-def test_nothing_to_compose_is_unknown() -> None:
-    merged = compose([], Extent(low_x=-2, low_y=-1, high_x=2, high_y=1), 0.05)
-    assert merged.data.shape == (2, 4)
-    assert (merged.data == -1).all()
-
-
 def test_finer_grid_keeps_its_thin_walls() -> None:
     fine = np.zeros((40, 40), dtype=np.int8)
     fine[:, 17] = 100  # a wall of 1 cm
@@ -77,22 +65,12 @@ def test_every_cell_counts_in_exactly_one_larger_cell(factor: int) -> None:
     assert np.array_equal(coarse.data, fine.reshape(6, factor, 7, factor).max(axis=(1, 3)))
 
 
-def test_coarser_grid_is_repeated() -> None:
-    fine = resample(_grid([[0, 100]], resolution=0.2), 0.05)
-    assert fine.data.tolist() == [[0] * 4 + [100] * 4] * 4
-
-
 def test_resample_keeps_the_place_under_yaw(office: Grid) -> None:
     turned = Grid(data=office.data, resolution=0.05, origin=Pose2(x=3.0, y=1.0, yaw=1.0))
     coarse = resample(turned, 0.1)
     assert coarse.origin == turned.origin
     walls, kept = turned.points(turned.occupied), coarse.points(coarse.occupied)
     assert np.allclose(walls.mean(axis=0), kept.mean(axis=0), atol=0.1)
-
-
-def test_same_resolution_as_float32_is_not_resampled(office: Grid) -> None:
-    grid = Grid(data=office.data, resolution=float(np.float32(0.05)))
-    assert resample(grid, 0.05) is grid
 
 
 def test_extent_in_blocks_covers_and_never_shrinks() -> None:
@@ -112,21 +90,6 @@ def test_crop_known_cuts_margins_and_keeps_the_place() -> None:
     assert cropped.data.shape == (2, 5)
     assert np.allclose(cropped.points(cropped.known), grid.points(grid.known))
     assert crop_known(Grid(data=np.full((3, 3), -1, dtype=np.int8), resolution=0.1)) is None
-
-
-@pytest.mark.parametrize(
-    ("data", "resolution", "origin"),
-    [
-        (np.zeros((2, 2), dtype=np.int16), 0.05, Pose2()),
-        (np.zeros(4, dtype=np.int8), 0.05, Pose2()),
-        (np.zeros((2, 2), dtype=np.int8), 0.0, Pose2()),
-        (np.zeros((2, 2), dtype=np.int8), 0.05, Pose2(x=math.nan)),
-        (np.zeros((1, 30_001), dtype=np.int8), 0.05, Pose2()),
-    ],
-)
-def test_grid_refuses_what_no_map_is(data: Any, resolution: float, origin: Pose2) -> None:
-    with pytest.raises(ValueError, match=r"grid\."):
-        Grid(data=data, resolution=resolution, origin=origin)
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.0125, 0.025, 0.0375, -0.025])

@@ -130,12 +130,6 @@ def test_other_resolution_is_resampled(view: View) -> None:
 # --- estimate --------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_received_publishes_nothing() -> None:
-    result = _merger(Mode.ESTIMATE).merge()
-    assert result.grid is None
-    assert result.statuses == ()
-
-
 def test_estimate_attaches_a_chain_and_the_reference_is_the_lowest_name(view: View) -> None:
     """robot1 and robot3 share no wall: robot3 hangs on robot1 through robot2."""
     result = _settled(_fed(_merger(Mode.ESTIMATE), view))
@@ -202,14 +196,6 @@ def test_removed_map_leaves_the_chain_connected(view: View) -> None:
     merger.remove("robot2")
     result = _settled(merger)
     assert set(result.transforms) == {"robot1", "robot3"}
-
-
-def test_number_of_robots_is_bounded() -> None:
-    merger = _merger(Mode.KNOWN)
-    grid = Grid(data=np.zeros((2, 2), dtype=np.int8), resolution=0.05)
-    refusals = [merger.update(f"r{n}", grid) for n in range(MAX_ROBOTS + 1)]
-    assert refusals[:-1] == [""] * MAX_ROBOTS
-    assert refusals[-1]
 
 
 # --- track -----------------------------------------------------------------------------------------------------------

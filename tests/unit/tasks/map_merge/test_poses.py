@@ -32,23 +32,3 @@ def test_yaml_and_json_are_read_and_the_argument_wins(tmp_path: Path) -> None:
 def test_faulty_argument_is_named(text: str) -> None:
     with pytest.raises(ConfigError, match="--pose"):
         read_poses([text], None)
-
-
-@pytest.mark.parametrize(
-    "content", ["[1, 2]", "robot1: [1, 2]", "robot1: {x: 1}", "robot1: ja", "robot1: [1, 2, .inf]", "{", "7: [1, 2, a]"]
-)
-def test_faulty_file_is_named(tmp_path: Path, content: str) -> None:
-    file = tmp_path / "poses.yaml"
-    file.write_text(content)
-    with pytest.raises(ConfigError, match=r"poses\.yaml"):
-        read_poses([], file)
-
-
-def test_all_faults_come_at_once() -> None:
-    with pytest.raises(ConfigError, match=r"a=1[\s\S]*b=2"):
-        read_poses(["a=1", "b=2"], None)
-
-
-def test_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="absent"):
-        read_poses([], tmp_path / "absent.yaml")

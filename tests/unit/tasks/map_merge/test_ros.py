@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from zsched.core.route.ros2 import Attachment, decode_attachment
-from zsched.tasks.map_merge.__main__ import parser
 from zsched.tasks.map_merge.ros import RosPublisher
 
 
@@ -24,20 +23,3 @@ def test_numbers_are_gapless_over_what_went_out() -> None:
     assert [one.sequence for one in sent if one is not None] == [1, 2]
     assert {one.stamp_ns for one in sent if one is not None} == {1_700_000_000_000_000_000}
     assert len({one.gid for one in sent if one is not None}) == 1
-
-
-def test_two_publishers_differ() -> None:
-    gids: list[bytes] = []
-
-    def put(_payload: bytes, attachment: bytes) -> bool:
-        gids.append(attachment[17:])
-        return True
-
-    for _ in range(2):
-        RosPublisher(put).put(b"")
-    assert gids[0] != gids[1]
-
-
-def test_the_option_is_there_and_off() -> None:
-    assert parser().parse_args([]).ros2 is False
-    assert parser().parse_args(["--ros2"]).ros2 is True

@@ -12,7 +12,7 @@ import pytest
 
 from zsched.core.profile.means import STALE_S
 from zsched.host.clock import monotonic_s
-from zsched.host.machine.gauges import LOOK_S, REST_S, GaugeWatch, battery, gpu, readers, temperature_c
+from zsched.host.machine.gauges import LOOK_S, REST_S, GaugeWatch, battery, gpu, temperature_c
 
 NVML = """
 typedef struct { unsigned gpu, memory; } rates;
@@ -40,11 +40,6 @@ def tree(root: Path, **files: str) -> Path:
 
 def supply(root: Path, name: str, **files: str) -> None:
     tree(root, **{f"sys__class__power_supply__{name}__{key}": f"{text}\n" for key, text in files.items()})
-
-
-def test_a_machine_without_any_gauge_measures_none(tmp_path: Path) -> None:
-    assert [reader.read() for reader in readers(tmp_path).values()] == [None, None, None]
-    assert GaugeWatch(tmp_path).look() == ()
 
 
 def test_a_battery_of_the_system_counts_and_a_mouse_does_not(tmp_path: Path) -> None:
@@ -87,11 +82,6 @@ def test_a_processor_s_own_sensor_counts_beside_a_zone_of_the_firmware_s(tmp_pat
     assert temperature_c.Reader(tmp_path).read() == 32.0
     tree(tmp_path, sys__class__hwmon__hwmon1__name="k10temp\n", sys__class__hwmon__hwmon1__temp1_input="81125")
     assert temperature_c.Reader(tmp_path).read() == 81.125
-
-
-def test_without_thermal_zones_the_hottest_of_hwmon_counts(tmp_path: Path) -> None:
-    tree(tmp_path, sys__class__hwmon__hwmon0__temp1_input="45000", sys__class__hwmon__hwmon1__temp2_input="62250")
-    assert temperature_c.Reader(tmp_path).read() == 62.25
 
 
 @pytest.mark.parametrize(
