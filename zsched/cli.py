@@ -19,20 +19,14 @@ from typing import Annotated, NoReturn
 import typer
 
 from zsched.commands.base.common import warn
-from zsched.commands.program import Program
+from zsched.commands.program import Program, show_all
 from zsched.core.values.exits import EXIT_FAILED
-
-EPILOG = (
-    "Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
-    "10 something would change (--plan), 75 the name is taken by another machine (up), 78 bad fleet file, "
-    "79 ended by `zsched leave` (up)."
-)
 
 app = typer.Typer(
     name="zsched",
     cls=Program,
-    help="Masterless scheduling of shared robot tasks: profile, score, vote, commit, reroute.",
-    epilog=EPILOG,
+    epilog="Exit codes: 0 fine, 1 failed, 2 usage, 3 daemon not reachable, 4 reachable but degraded, 5 timed out, "
+    "10 --plan: it would change, 75 up: the name is taken, 78 bad fleet file, 79 up: ended by `zsched leave`.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,  # rich costs 60 ms of import
@@ -54,6 +48,9 @@ def program(
     version_: Annotated[
         bool,
         typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show_version),
+    ] = False,
+    all_: Annotated[
+        bool, typer.Option("--help-all", help="Show every verb, by noun.", is_eager=True, callback=show_all)
     ] = False,
 ) -> None:
     """Masterless scheduling of shared robot tasks: profile, score, vote, commit, reroute."""

@@ -19,6 +19,7 @@ import pytest
 import typer.main
 
 from zsched.cli import app
+from zsched.commands.program import LAB_VERBS
 from zsched.config.timing import PROFILES
 from zsched.core.values import (
     codec as wire,  # the pipe's kinds are registered with the codec when its module is imported
@@ -328,6 +329,27 @@ def test_commands_are_the_command_line_s(name: str) -> None:
 def test_planted_wrong_commands_are_found() -> None:
     text = "sudo bin/zsched ini --node x\nzsched status --jsno | less\nzsched check fleet.yaml   # fine"
     assert wrong_commands(text) == ["zsched ini", "zsched status --jsno"]
+
+
+def examples(group: Any, before: str = "zsched") -> Iterator[tuple[str, str]]:
+    """(each verb below it, the example that its help shows; empty: none)."""
+    for name in group.list_commands(None):
+        command = group.get_command(None, name)
+        words = f"{before} {name}"
+        if name in LAB_VERBS:
+            continue
+        if hasattr(command, "commands"):
+            yield from examples(command, words)
+        else:
+            yield words, (re.findall(r"^Example: (.*)$", inspect.cleandoc(command.help), re.MULTILINE) or [""])[0]
+
+
+def test_the_help_of_every_verb_has_an_example_that_can_be_typed() -> None:
+    found = dict(examples(PROGRAM))
+    assert len(found) > 50
+    assert [words for words, example in found.items() if f"{words} " not in f"{example} "] == []
+    assert wrong_commands("\n".join(found.values())) == []
+    assert max(map(len, found.values())) < 80 - len("  Example: ")
 
 
 # --- decisions -------------------------------------------------------------------------------------------------------

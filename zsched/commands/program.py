@@ -9,13 +9,10 @@ typer apps. Does not know: any verb.
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import typer
 
@@ -24,48 +21,83 @@ from zsched.commands.base.options import command_of
 from zsched.core.values.exits import EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from importlib.metadata import EntryPoint
 
 GROUP: Final = "zsched.commands"
-VERBS: Final = {
-    "up": "commands.up",
-    "init": "commands.members.init",
-    "new": "tools.example",
-    "dev": "tools.dev.verb",
-    "status": "commands.look.status",
-    "top": "tools.watch.screen",
-    "web": "tools.watch.web",
-    "record": "tools.watch.record",
-    "trace": "tools.watch.trace",
-    "explain": "commands.look.explain",
-    "history": "commands.look.history",
-    "events": "commands.look.history",
-    "move": "commands.act.move",
-    **dict.fromkeys(("pin", "unpin", "pause", "resume"), "commands.act.hold"),
-    "tune": "commands.act.tune",
-    "restart": "commands.act.restart",
-    **dict.fromkeys(("drain", "undrain"), "commands.act.flags"),
-    **dict.fromkeys(("invite", "join"), "commands.members.membership"),
-    "leave": "commands.members.leave",
-    "rehearse": "tools.rehearsal.verb",
-    "doctor": "tools.doctor.verb",
-    "ping": "commands.look.ping",
-    "bugreport": "tools.bugreport",
-    "wait": "commands.look.wait",
-    "logs": "commands.look.logs",
-    "check": "commands.look.check",
-    "apply": "commands.act.apply",
-    "edit": "commands.members.fleet",
-    "version": "commands.base.versions",
-    **dict.fromkeys(("install", "uninstall"), "tools.install"),
-    "stream": "tools.stream",
-    "fleet": "commands.members.fleet",
-    **dict.fromkeys(("task", "node"), "commands.act.entries"),
-    "pki": "commands.members.pki",
-    "metrics": "tools.metrics",
+NOUNS: Final = {
+    "the fleet": {
+        "status": "commands.look.status",
+        "top": "tools.watch.screen",
+        "web": "tools.watch.web",
+        "record": "tools.watch.record",
+        "history": "commands.look.history",
+        "events": "commands.look.history",
+        "wait": "commands.look.wait",
+        "rehearse": "tools.rehearsal.verb",
+        "fleet": "commands.members.fleet",
+        "check": "commands.look.check",
+        "apply": "commands.act.apply",
+        "edit": "commands.members.fleet",
+        "pki": "commands.members.pki",
+    },
+    "a task and its streams": {
+        "task": "commands.act.entries",
+        "new": "tools.example",
+        "dev": "tools.dev.verb",
+        "explain": "commands.look.explain",
+        "move": "commands.act.move",
+        **dict.fromkeys(("pin", "unpin", "pause", "resume"), "commands.act.hold"),
+        "tune": "commands.act.tune",
+        "restart": "commands.act.restart",
+        "logs": "commands.look.logs",
+        "stream": "tools.stream",
+        "trace": "tools.watch.trace",
+    },
+    "a node": {
+        "node": "commands.act.entries",
+        **dict.fromkeys(("invite", "join"), "commands.members.membership"),
+        "leave": "commands.members.leave",
+        **dict.fromkeys(("drain", "undrain"), "commands.act.flags"),
+        "ping": "commands.look.ping",
+        "metrics": "tools.metrics",
+    },
+    "this machine": {
+        "doctor": "tools.doctor.verb",
+        "bugreport": "tools.bugreport",
+        **dict.fromkeys(("install", "uninstall"), "tools.install"),
+        "init": "commands.members.init",
+        "up": "commands.up",
+        "version": "commands.base.versions",
+    },
 }
-"""{verb: the module of `zsched` that has a function, or a group, of its name}, in the order of the help."""
+"""{noun: {verb: the module of `zsched` that has a function, or a group, of its name}}, as the long help shows them."""
+VERBS: Final = {verb: module for verbs in NOUNS.values() for verb, module in verbs.items()}
+FRONT: Final = """\
+Usage: zsched VERB [OPTIONS] [ARGUMENTS]...
+
+start  dev           run a fleet and your task on this machine alone
+       new           write a small task to begin with
+       fleet create  make this machine the first one of a new fleet
+       invite        write the file with which another machine joins
+       join          make this machine a node, by such a file
+
+look   status        nodes, tasks, owners, and what is wrong
+       top           the same on the full screen, live
+       explain       why a task is where it is, and what would move it
+       history       every move: when, from where to where, why
+       doctor        what is wrong, and what to do
+
+act    move          hand a task over to a node now
+       drain         empty a node
+       pin           keep a task on a node
+       pause         let nothing move a task
+
+more   zsched --help-all has every verb, zsched VERB --help one with its options
+e.g.   zsched dev --task worker.py                              run your program
+       zsched invite edge2 --address 192.0.2.22 > edge2.invite  add a machine
+       zsched drain edge1 -m "new fan"                          empty a machine
+"""
+"""What the help shows first: no more than a terminal of 80 columns and 24 lines."""
 UNTOLD: Final = {"complete": "commands.completion"}
 """The same, of those that the help leaves out."""
 LAB_VERBS: Final = frozenset({"bench", "demo"})
@@ -73,21 +105,10 @@ LAB_VERBS: Final = frozenset({"bench", "demo"})
 INSTEAD: Final = {
     "add": "zsched task add FILE, or zsched node add NAME",
     "list": "zsched status (nodes and tasks), or zsched stream list",
-    "weights": "zsched tune TASK cpu=0.6 memory=0.4 network=0",
-    "retry": "zsched restart TASK NODE",
-    **dict.fromkeys(("completion", "man"), "zsched install, which brings it"),
-    "eligible": "zsched drain NODE --only new, or zsched undrain NODE",
-    "replay": "zsched explain --replay FILE",
-    "site": "zsched status --site",
     "recover": "zsched fleet recover",
-    "rejoin": "zsched fleet recover --rejoin",
-    "init --generation": "zsched fleet recover --generation G",
-    "init --settle": "zsched fleet recover --settle",
-    "init --example": "zsched new KIND [DIR]",
-    "maint": "zsched status, which tells every order",
     "remove": "zsched node remove NODE, or zsched task remove TASK",
 }
-"""{words that are no verb, or none any more: what to write}: of other programs, and of older ones."""
+"""{a word that is no verb: what to write}: of other programs."""
 DRASTIC: Final = frozenset({"init", "leave", "uninstall"})
 """Verbs that are proposed to nobody who has written something else."""
 
@@ -106,20 +127,6 @@ def installed_verbs() -> dict[str, EntryPoint]:
 def _own(name: str) -> Any:
     module = import_module(f"zsched.{(VERBS | UNTOLD)[name]}")
     return command_of(name, getattr(module, name))
-
-
-def _told(name: str) -> str:
-    """The first sentence of a verb's help, out of its source: to import all of them takes half a second, and zenoh."""
-    spec = find_spec(f"zsched.{VERBS[name]}")
-    assert spec is not None
-    assert spec.origin is not None
-    for node in ast.parse(Path(spec.origin).read_bytes()).body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
-            first = (ast.get_docstring(node) or "").partition("\n\n")[0]
-            return " ".join(f"{first} ".partition(". ")[0].split()).removesuffix(".") + "."
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name and isinstance(node.value, ast.Call):
-            return str(ast.literal_eval(node.value.args[1]))
-    raise AssertionError(name)
 
 
 class OwnVerbs(Mapping[str, Any]):
@@ -146,21 +153,19 @@ class Program(Verbs):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """All verbs, for the help."""
+        return [*super().list_commands(ctx), *(name for name in installed_verbs() if name not in VERBS)]
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """A first screen; `zsched --help-all` is typer's help."""
         del ctx
-        return [*VERBS, *(name for name in installed_verbs() if name not in VERBS)]
+        formatter.write(FRONT)
 
-    def told_briefly(self, ctx: Any, name: str) -> str:
-        """As of any group; of a verb of the program it is read, and the verb not made."""
-        return _told(name) if name in VERBS else super().told_briefly(ctx, name)
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """As typer's; a verb that had an option says what is written in its place."""
-        given = {word.partition("=")[0] for word in args[1:]}
-        for words, told in INSTEAD.items():
-            verb, _, option = words.partition(" ")
-            if option in given and args[0] == verb:
-                return verb, _refusing(verb, f"it has no {option}; write {told}", EXIT_USAGE), args[1:]
-        return super().resolve_command(ctx, args)
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """All verbs, by the noun that they are about."""
+        for noun, names in NOUNS.items():
+            self.write_verbs(ctx, formatter, noun.capitalize(), names)
+        if brought := [name for name in self.list_commands(ctx) if name not in VERBS]:
+            self.write_verbs(ctx, formatter, "What other packages bring", brought)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """One verb.
@@ -184,13 +189,22 @@ class Program(Verbs):
         return command
 
 
-def _instead(name: str, verbs: Iterable[str]) -> str:
+def show_all(ctx: typer.Context, is_wanted: bool) -> None:
+    """Typer's help of the program, if ``--help-all`` is given."""
+    if is_wanted:
+        formatter = ctx.make_formatter()
+        Verbs.format_help(cast("Program", ctx.command), ctx, formatter)
+        typer.echo(formatter.getvalue().rstrip())
+        raise typer.Exit
+
+
+def _instead(name: str, verbs: Mapping[str, Any]) -> str:
     """What to write in place of a word that is no verb."""
     import difflib  # noqa: PLC0415 - only when something is wrong
 
     near = difflib.get_close_matches(name, sorted({*verbs} - DRASTIC), n=1)
     told = INSTEAD.get(name) or "".join(f"zsched {verb}" for verb in near)
-    return f"write {told}" if told else "`zsched --help` lists them"
+    return f"write {told}" if told else "`zsched --help-all` lists them"
 
 
 def _refusing(name: str, text: str, code: int = EXIT_FAILED) -> Any:

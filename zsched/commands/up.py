@@ -33,7 +33,10 @@ def up(
     here: Machine,
     log_level: Annotated[LogLevel, typer.Option("--log-level", help="What goes to stderr.")] = LogLevel.INFO,
 ) -> NoReturn:
-    """Run this machine's daemon in the foreground (what systemd runs)."""
+    """Run this machine's daemon in the foreground (what systemd runs).
+
+    Example: sudo zsched up
+    """
     file = places.config_path(here.config, os.environ)
     need_file(file)
     name = own_name(here.node)

@@ -63,6 +63,8 @@ def bugreport(
 ) -> int:
     """Write one file for the person who looks for a fault: every node's status, the doctor's words, the journal.
 
+    Example: sudo zsched bugreport
+
     Secrets that a name gives away are taken out. It prints what is in the file.
     """
     now = datetime.fromtimestamp(wall_ns() / 1e9, UTC)

@@ -42,6 +42,8 @@ def new(
 ) -> None:
     """Write a small task to begin with: a fleet file, a worker, an application (see `zsched dev`).
 
+    Example: zsched new python my-task
+
     Nothing is overwritten.
     """
     for path in write_example(kind, folder):

@@ -110,6 +110,8 @@ class Piece(Struct, frozen=True, kw_only=True):
 def install(plan: PlanOption = False, root: RootOption = Path("/")) -> int:
     """Let the system find a zsched that pip installed: units, the user, completion, manual pages, the program.
 
+    Example: sudo /opt/zsched/bin/zsched install
+
     It links or copies, says each step, and starts and enables nothing. Once more, it renews what is old.
     """
     root = root.absolute()
@@ -147,7 +149,10 @@ def install(plan: PlanOption = False, root: RootOption = Path("/")) -> int:
 
 
 def uninstall(plan: PlanOption = False, root: RootOption = Path("/")) -> int:
-    """Stop the services and take away what `zsched install` made. Fleet file, state and the program stay."""
+    """Stop the services and take away what `zsched install` made. Fleet file, state and the program stay.
+
+    Example: sudo zsched uninstall
+    """
     root = root.absolute()
     prefix = Path(sys.prefix)
     _check(prefix, root)

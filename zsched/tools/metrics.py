@@ -180,7 +180,10 @@ def _value(value: float) -> str:
 
 
 def metrics_print(asked: Asks) -> int:
-    """Print a node's figures in Prometheus' text format."""
+    """Print a node's figures in Prometheus' text format.
+
+    Example: zsched metrics print
+    """
     sys.stdout.write(metrics_text(ask_door(asked.door(), {"verb": "status"})))
     return EXIT_OK
 
@@ -190,6 +193,8 @@ def metrics_write(
     path: Annotated[Path, typer.Argument(metavar="PATH", help="As /var/lib/node_exporter/zsched.prom.")],
 ) -> int:
     """Write them to a file, whole or not at all, for node_exporter's textfile collector.
+
+    Example: zsched metrics write /var/lib/prometheus/node-exporter/zsched.prom
 
     Where nobody answers the file says zsched_up 0, and this exits with 3.
     """

@@ -394,12 +394,17 @@ class Tap(Local):
 
 
 def list_(asked: Answers, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
-    """List a node's streams: from where to where, how fast, and what was dropped."""
+    """List a node's streams: from where to where, how fast, and what was dropped.
+
+    Example: zsched stream list
+    """
     return show_list(StreamView(door=asked.door(), is_json=asked.json_, window_s=window), key)
 
 
 def hz(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
     """Show how often something comes on each key, and the shortest and longest gap.
+
+    Example: zsched stream hz map_merge/in/0
 
     Of a stream, both its ends are shown. Exits with 1 when nothing came in the last window.
     """
@@ -407,7 +412,10 @@ def hz(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
 
 
 def bw(tap: Tap, key: KeyArgument = None, window: WindowOption = 2.0) -> int:
-    """Show how many bytes per second come on each key, and the smallest and largest message."""
+    """Show how many bytes per second come on each key, and the smallest and largest message.
+
+    Example: zsched stream bw map_merge/in/0
+    """
     return tap.run("bw", key, window)
 
 
@@ -419,6 +427,8 @@ def tail(
     ] = None,
 ) -> int:
     """Print every message as it comes: key, size, encoding, the first bytes.
+
+    Example: zsched stream tail map_merge/in/0
 
     Exits with 1 when nothing came within the timeout.
     """

@@ -76,7 +76,6 @@ class Fleet:
         self.answers: dict[str | None, Any] = {"robot1": robot, None: robot, "edge1": edge}
         self.asked: list[str | None] = []
         self.silent: set[str] = set()
-        self.tells_sums = True
         self.log: DecisionLog | None = None
 
     def ask(self, door: Door, request: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
@@ -90,7 +89,7 @@ class Fleet:
         if request["task"] != "merge":
             return {"outcome": "invalid", "detail": "no task 'merg'; there are merge"}
         answer = json.loads(json.dumps(answer_json(self.answers[door.node])))
-        return dict(answer) if self.tells_sums else {"explanation": answer["explanation"]}
+        return dict(answer)
 
 
 @pytest.fixture
@@ -103,14 +102,6 @@ def fleet(monkeypatch: pytest.MonkeyPatch) -> Fleet:
 def asked(node: str | None = None, task: str = "merge", *, is_json: bool = False, **more: Any) -> int:
     said: Any = SimpleNamespace(door=lambda: Door(socket=Path("s"), node=node), json_=is_json)
     return explain(said, task, **more)
-
-
-def test_a_daemon_that_tells_no_sums_gets_the_same_page(fleet: Fleet, capsys: pytest.CaptureFixture[str]) -> None:
-    assert asked(is_json=True) == 0
-    told = json.loads(capsys.readouterr().out)
-    fleet.tells_sums = False
-    assert asked(is_json=True) == 0
-    assert json.loads(capsys.readouterr().out) == told
 
 
 def test_verbs_that_only_show_load_no_values_and_no_scheduler() -> None:

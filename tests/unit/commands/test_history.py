@@ -146,7 +146,6 @@ def test_what_is_known_from_before_a_restart_is_no_move(pages: Pages, capsys: py
     older = {**MOVE, "left": None, "votes": [], "reason": "known from before the restart", "is_known": True}
     known = {**older, "reason": "as it was", "is_known": True}
     pages.entries = [
-        entry("learnt", 60.0, move={**older, "owner": None}),
         entry("learnt", 50.0, move=older),
         entry("learnt", 40.0, move=known),
     ]

@@ -259,7 +259,7 @@ def test_help_of_every_verb_fits_a_small_terminal(verb: str, monkeypatch: pytest
     assert result.exit_code == 0
     assert result.stdout.startswith("Usage: ")
     assert max(map(len, result.stdout.splitlines())) <= 80
-    assert re.search(rf"^ +{verb} ", run("--help").stdout, re.MULTILINE)
+    assert re.search(rf"^ +{verb} ", run("--help-all").stdout, re.MULTILINE)
 
 
 # --- what is written about it ----------------------------------------------------------------------------------------

@@ -119,6 +119,8 @@ def apply(
 ) -> int:
     """Change the running fleet to what a fleet file says: shows what follows, asks, and has it agreed for all nodes.
 
+    Example: zsched apply fleet.yaml --plan
+
     The first one of a fleet agrees the file that its nodes run by. A danger has a name, and --accept takes it.
     Exits with 1 when the fleet was changed meanwhile, with 4 without a quorum, with 10 when --plan shows a change.
     """

@@ -27,14 +27,20 @@ FileArgument = Annotated[
 
 
 def task_add(said: Changes, file: FileArgument) -> int:
-    """Add the tasks of a file to the document; the rest of it stays as it is written."""
+    """Add the tasks of a file to the document; the rest of it stays as it is written.
+
+    Example: zsched task add echo.yaml
+    """
     return _add(said, "task", file)
 
 
 def task_remove(
     said: Changes, task: Annotated[str, typer.Argument(metavar="TASK", help="A task of the fleet.")]
 ) -> int:
-    """Take a task out of the document: its workers stop, its streams end (--accept remove-task)."""
+    """Take a task out of the document: its workers stop, its streams end (--accept remove-task).
+
+    Example: zsched task remove echo --accept remove-task
+    """
     view = said.order("task", "remove", task)
 
     def make(held: InForce) -> str:
@@ -52,6 +58,8 @@ def task_promote(
     ] = None,
 ) -> int:
     """Let a changed worker go on to all nodes, after `zsched apply --pause-after` and a look at the first ones.
+
+    Example: zsched task promote map_merge
 
     To take it back instead, apply the file of before.
     """
@@ -80,7 +88,10 @@ def task_promote(
 
 
 def node_add(said: Changes, file: FileArgument) -> int:
-    """Add the nodes of a file to the document; then start their daemons."""
+    """Add the nodes of a file to the document; then start their daemons.
+
+    Example: zsched node add edge2.yaml
+    """
     return _add(said, "node", file)
 
 
@@ -88,6 +99,8 @@ def node_remove(
     said: Changes, name: Annotated[str, typer.Argument(metavar="NODE", help="A node of the fleet that owns no task.")]
 ) -> int:
     """Take a node out of the document, and out of every list of names in it (--accept remove-node).
+
+    Example: zsched node remove edge2 --accept remove-node
 
     Refused for the last elector, and for a node that is alive and owns tasks.
     """
@@ -98,7 +111,10 @@ def node_forget(
     said: Changes,
     name: Annotated[str, typer.Argument(metavar="NODE", help="A node that is gone and does not come back.")],
 ) -> int:
-    """Take out a node that is gone for good; refused while it is alive (--accept remove-node)."""
+    """Take out a node that is gone for good; refused while it is alive (--accept remove-node).
+
+    Example: zsched node forget edge2 --accept remove-node
+    """
     return _drop(said, name, is_lost=True)
 
 

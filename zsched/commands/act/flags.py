@@ -96,6 +96,8 @@ def drain(
 ) -> int:
     """Empty nodes: they get nothing new, and their tasks move away one after another, also pinned ones (not --hard).
 
+    Example: zsched drain edge1 -m "new fan"
+
     Watches until each node owns nothing and its old slots are closed. The nodes stay drained, over restarts, until
     `zsched undrain`. A task that nobody else can have stays. Without nodes it lists the drained ones. Exits with 5 at
     the deadline; the drain goes on all the same.
@@ -163,6 +165,8 @@ def undrain(
     ] = None,
 ) -> int:
     """End every drain of nodes: they may get tasks again, when the fleet finds them better.
+
+    Example: zsched undrain edge1
 
     Without a node it lists those that are drained.
     """

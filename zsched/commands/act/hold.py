@@ -49,13 +49,18 @@ def pin(
 ) -> int:
     """Keep a task on a node: it moves for an escape only, and comes back when that node is fit again.
 
+    Example: zsched pin map_merge edge2 --for 2h
+
     Without a task it lists the pins.
     """
     return _Hold(view=said.order(for_=for_), verb="pin", node=to, is_hard=hard).give([task] if task else [])
 
 
 def unpin(said: Orders, task: OrListArgument = None) -> int:
-    """End a task's pin: the fleet places it again. Without a task it lists the pins."""
+    """End a task's pin: the fleet places it again. Without a task it lists the pins.
+
+    Example: zsched unpin map_merge
+    """
     return _Hold(view=said.order(), verb="unpin").give([task] if task else [])
 
 
@@ -70,13 +75,18 @@ def pause(
 ) -> int:
     """Let nothing move tasks but `zsched move`: a dead owner is not replaced.
 
+    Example: zsched pause --all --for 10m
+
     Without a task it lists the pauses.
     """
     return _Hold(view=said.order(for_=for_), verb="pause", is_waiting=wait).give(tasks or [], is_all=all_)
 
 
 def resume(said: Orders, tasks: TasksArgument = None, all_: AllOption = False) -> int:
-    """End the pause of tasks. Without a task it lists the pauses."""
+    """End the pause of tasks. Without a task it lists the pauses.
+
+    Example: zsched resume --all
+    """
     return _Hold(view=said.order(), verb="resume").give(tasks or [], is_all=all_)
 
 

@@ -48,6 +48,8 @@ def move(
 ) -> int:
     """Hand a task over to a node, and wait until its streams have settled there.
 
+    Example: zsched move map_merge edge2 -m "new lens on edge1"
+
     It does not pin: the fleet may move the task again when it has reason to. Exits with 5 when it has not settled in
     time; it goes on all the same.
     """

@@ -26,6 +26,8 @@ def restart(
 ) -> int:
     """Stop a task's worker and start it again, also one that has failed for good; that counts as no failure.
 
+    Example: zsched restart map_merge edge1
+
     The task pauses meanwhile if it is the owner's.
     """
     view = said.order()

@@ -90,6 +90,8 @@ def tune(
 ) -> int:
     """Show a task's tuning, or change it on the whole running fleet.
 
+    Example: zsched tune map_merge bonus=0.2
+
     A change is agreed like an allocation: it holds for every robot, or for none (exit 4 without a quorum).
     """
     view = said.order()
@@ -99,7 +101,7 @@ def tune(
     if task is None or not pairs:
         return _list(view, chosen)
     (known,) = chosen
-    file = file_tuning(known)
+    file = known["file_tuning"]
     after = tuned(known["tuning"], file, pairs)
     tuning = _checked(after, file)
     before, now = _flat(known["tuning"]), _flat(after)
@@ -174,12 +176,6 @@ def _own(after: Json) -> Json:
     return {key: _WORDS[key](value) if key in _WORDS and value is not None else value for key, value in given.items()}
 
 
-def file_tuning(task: Json) -> Json:
-    """The fleet file's tuning; a daemon of an older program does not tell it."""
-    found: Json = task.get("file_tuning") or task["tuning"]
-    return found
-
-
 def _flat(tuning: Json) -> Json:
     """Every setting; of the gauges' weights those above 0."""
     return {**shares(tuning["weights"]), **{key: tuning.get(key) for key in KEYS if key not in WEIGHTS}}
@@ -196,7 +192,7 @@ def _body(tasks: list[Json]) -> Json:
 
 
 def _told(task: Json, tuning: Json) -> Json:
-    file = _flat(file_tuning(task))
+    file = _flat(task["file_tuning"])
     return {"task": task["name"], "revision": task["revision"], "tuning": _flat(tuning), "file": file}
 
 

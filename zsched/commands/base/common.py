@@ -38,6 +38,11 @@ NAMED_OTHERWISE: Final = {
 }
 OBEYED: Final = re.compile("[\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What JSON leaves as it is and a terminal may obey: more controls, turns of the writing, halves of characters."""
+SHARED: Final = {
+    "Before a change": ("plan", "yes", "reason", "revision", "accept"),
+    "Which daemon, which files": ("node", "connect", "runtime_dir", "config", "state_dir"),
+}
+"""{title in a verb's help: options that many verbs have}; all others are its own."""
 LONGEST_SENTENCE: Final = 1000
 """Characters."""
 USAGE_ERROR: Final = "Error: "
@@ -140,13 +145,13 @@ class Verb(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Arguments and options; of an argument no type of Python's."""
-        rows: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        rows: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Arguments", "Options", *SHARED)}
         for param in self.get_params(ctx):
             record = param.get_help_record(ctx)
             if record is not None and param.param_type_name == ARGUMENT:
                 rows["Arguments"].append((shown_argument(param), record[1]))
             elif record is not None:
-                rows["Options"].append(record)
+                rows[next((title for title, names in SHARED.items() if param.name in names), "Options")].append(record)
         for title, found in rows.items():
             if found:
                 with formatter.section(title):
@@ -189,14 +194,14 @@ class Verbs(TyperGroup):
         return no_help_yet(super().get_help_option(ctx))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Each verb with its whole first sentence, over several lines if need be: typer's own cuts it at the width."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, self.told_briefly(ctx, name)) for name in self.list_commands(ctx)])
+        """All verbs below it."""
+        self.write_verbs(ctx, formatter, "Commands", self.list_commands(ctx))
 
-    def told_briefly(self, ctx: Any, name: str) -> str:
-        """The first sentence of a verb's help."""
-        verb: Any = self.get_command(ctx, name)
-        return str(verb.get_short_help_str(LONGEST_SENTENCE))
+    def write_verbs(self, ctx: Any, formatter: Any, title: str, names: Iterable[str]) -> None:
+        """Each with its whole first sentence, over several lines if need be: typer's own cuts it at the width."""
+        commands: dict[str, Any] = {name: self.get_command(ctx, name) for name in names}
+        with formatter.section(title):
+            formatter.write_dl([(name, one.get_short_help_str(LONGEST_SENTENCE)) for name, one in commands.items()])
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb."""

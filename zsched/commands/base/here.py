@@ -27,13 +27,7 @@ def need_file(file: Path) -> None:
     """Raise `CliError` (78) unless the fleet file can be read."""
     try:
         read_regular(file, MAX_FILE_BYTES)
-    except PermissionError as error:
-        raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {owner_of(file)}") from error
-    except FileNotFoundError as error:
-        raise CliError(
-            EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name it with --config, or {BECOME_A_NODE}"
-        ) from error
     except OSError as error:
-        raise CliError(
-            EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; name the fleet file with --config or ZSCHED_CONFIG"
-        ) from error
+        other = f"name it with --config, or {BECOME_A_NODE}"
+        advice = owner_of(file) if isinstance(error, PermissionError) else other
+        raise CliError(EXIT_CONFIG, f"{file}: cannot be read: {error.strerror}; {advice}") from error

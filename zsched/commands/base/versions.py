@@ -26,7 +26,10 @@ def versions() -> Json:
 
 
 def version(json_: JsonOption = False) -> None:
-    """Show the versions of zsched, its wire format, zenoh and Python."""
+    """Show the versions of zsched, its wire format, zenoh and Python.
+
+    Example: zsched version
+    """
     found = versions()
     if json_:
         print_json({"schema": "zsched.version/1", **found})

@@ -34,6 +34,8 @@ def check(
 ) -> int:
     """Check a fleet file: all faults that can be judged at once, each with file:line:col; exits with 78 on any.
 
+    Example: zsched check -v fleet.yaml
+
     A file without fault is one line. With -v it says when each task moves, setting by setting, once for tasks alike.
     """
     result = judged(check_file(places.config_path(file or config, os.environ)))

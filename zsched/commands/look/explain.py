@@ -56,6 +56,8 @@ def explain(
 ) -> int:
     """Show a robot's last judgement of a task with all its figures, and what would have to change for a move.
 
+    Example: zsched explain map_merge
+
     On an edge, which decides nothing, a robot is asked in its place. With --at 12 it shows the judgement that came
     before the move to epoch 12, and that move; with an age or a time, the one of that moment.
     """
@@ -99,7 +101,6 @@ def explanation(door: Door, task: str) -> tuple[Json, Json]:
     written: Json | None = told.get("decision")
     if written is None:
         raise CliError(EXIT_FAILED, f"{told['node']} has judged nothing of {task} yet; ask again in a second")
-    sums = answer.get("sums") or _sums(written)  # an older daemon tells none
     vote = told.get("vote")
     more = {
         "newest_revision": told["allocation"]["revision"],
@@ -108,13 +109,7 @@ def explanation(door: Door, task: str) -> tuple[Json, Json]:
         "knows_jobs": told.get("knows_jobs"),
     }
     head = {"schema": SCHEMA, "node": told["node"], "age_s": told.get("age_s", 0.0)}
-    return {**head, **sums, **more, "at": None, "made": None, "robot": None}, written
-
-
-def _sums(written: Json) -> Json:
-    from zsched.commands.look.replay import sums  # noqa: PLC0415 - as above
-
-    return sums(written)
+    return {**head, **answer["sums"], **more, "at": None, "made": None, "robot": None}, written
 
 
 def _of_robot(door: Door, task: str, robot: str) -> tuple[Json, Json]:
@@ -182,13 +177,14 @@ def _past(door: Door, task: str, point: Point) -> tuple[Json, Json]:
         is_edge = answer["explanation"]["kind"] == "edge"
         edge = f"; {node} is an edge and decides nothing: ask on a robot" if is_edge else ""
         raise CliError(EXIT_FAILED, f"the log of {node} has no judgement of {task} {point.told()}{edge}")
+    from zsched.commands.look.replay import sums  # noqa: PLC0415 - as above
+
     written: Json = entry["decision"]
-    told = _sums(written)
     head = {"schema": SCHEMA, "node": node, "age_s": max(now - float(entry["at"]), 0.0)}
     made = None if move is None else _move(move, now)
     revision = written["figures"]["allocation"]["revision"]
     more = {"newest_revision": revision, "vote": None, "plan": None, "knows_jobs": None}
-    return {**head, **told, **more, "at": wall_text(entry["at"]), "made": made, "robot": None}, written
+    return {**head, **sums(written), **more, "at": wall_text(entry["at"]), "made": made, "robot": None}, written
 
 
 def _move(entry: Json, now: float) -> Json:
@@ -209,8 +205,6 @@ def _search(door: Door, task: str, point: Point) -> tuple[str, float, Json | Non
     epochs: list[int] = []
     while True:
         answer = ask_door(door, {"verb": "log", "judgement": wish, "cursor": cursor})
-        if "judgement" not in answer:
-            raise CliError(EXIT_FAILED, f"the daemon of {answer['node']} is older than --at; restart it")
         judgement = answer["judgement"] or judgement
         told = answer["move"]
         move = told if told is not None and (move is None or is_move(told)) else move

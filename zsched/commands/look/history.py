@@ -110,6 +110,8 @@ def history(
 ) -> int:
     """Show every change of owner in a node's decision log: when, from where to where, why, and who voted for it.
 
+    Example: zsched history map_merge --since 1d
+
     It also tells what operators have changed, with their names.
 
     With --site one node of each fleet of the site is asked. A fleet that does not answer is named, and the others are
@@ -229,8 +231,6 @@ def moves_of(entries: Iterable[Json], now: float, task: str | None) -> Iterator[
         move = entry.get("move")
         if move is None or task not in (None, entry["task"]):
             continue
-        if move["owner"] is None:
-            continue  # an older daemon's line: nobody has had the task yet
         yield {
             **when_of(entry, now),
             "task": entry["task"],
@@ -321,7 +321,10 @@ def events(
     ] = None,
     json_: Annotated[bool, typer.Option("--json", help="One JSON object per line.")] = False,
 ) -> int:
-    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers."""
+    """Show what the decision log tells: judgements that changed, votes, moves, steps of handovers, workers, peers.
+
+    Example: zsched events -f --types move,vote
+    """
     of_task, of_node = (None, None) if about is None else subject_of(about)
     of_types, since_s = () if types is None else types_of(types), None if since is None else duration_s(since)
     door, away = asked.door(), Away("events", "until Ctrl-C")

@@ -215,6 +215,8 @@ def logs(
 ) -> int:
     """Show what a task's worker has printed lately, on whichever node it runs.
 
+    Example: zsched logs map_merge -f --level warning
+
     A daemon keeps the last 400 lines of each of its workers since its own start; that machine's journal has older ones.
     """
     view = LogsView(door=asked.door(), is_json=asked.json_, is_followed=follow, most=lines, level=level)

@@ -70,6 +70,8 @@ def ping(
 ) -> int:
     """Measure how long a node's control and data sessions take to answer, and by which address.
 
+    Example: sudo zsched ping edge1
+
     Exits with 3 when the node answers by no way, with 1 when by some only.
     """
     own_name(node)

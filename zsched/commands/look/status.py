@@ -37,6 +37,8 @@ def status(
 ) -> int:
     """Show nodes, tasks, owners and what is wrong; with -v also decisions, votes and streams.
 
+    Example: zsched status -v
+
     Exits with 4 while the fleet is degraded: no quorum, or a task without a live owner. With --site it asks the fleets
     under `site:` in the document, or in the fleet file, and one that does not answer is degraded, too.
     """

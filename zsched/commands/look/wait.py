@@ -128,6 +128,8 @@ def wait(
 ) -> int:
     """Wait until a condition holds; say what is missing if it does not in time.
 
+    Example: zsched wait --for healthy --timeout 60
+
     Exits with 5 when the time is over, with 3 when nobody answers then. A daemon that is not there yet is waited for.
     """
     wanted = parse_condition(condition)

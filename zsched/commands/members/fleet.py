@@ -32,7 +32,10 @@ SCHEMA = "zsched.fleet.show/1"
 
 
 def show(asked: Answers) -> int:
-    """Show the fleet's revision, its electors and its document, and which node goes by which."""
+    """Show the fleet's revision, its electors and its document, and which node goes by which.
+
+    Example: zsched fleet show
+    """
     door = asked.door()
     held = in_force(door)
     names = [str(node["name"]) for node in status_of(door)["nodes"]]
@@ -82,7 +85,10 @@ def _said(held: InForce, one: Json, told: list[Json]) -> str:
 
 
 def export(asked: Asks, file: OutputOption = None) -> int:
-    """Write the document as its operator wrote it, comments and all."""
+    """Write the document as its operator wrote it, comments and all.
+
+    Example: zsched fleet export > fleet.yaml
+    """
     door = asked.door()
     held = in_force(door)
     text = document_text(held)
@@ -183,6 +189,8 @@ def _open_editor(path: Path, env: Mapping[str, str]) -> None:
 
 def edit(said: Edits, pause_after: PauseAfterOption = None) -> int:
     """Open the fleet's document in your editor (VISUAL, EDITOR, else vi), and apply what comes of it.
+
+    Example: zsched edit
 
     A text with faults, or one that is refused, stays in a file that the message names.
     """

@@ -164,6 +164,8 @@ def init(
 ) -> None:
     """Create this node's blank state: "this name has never voted here".
 
+    Example: sudo zsched init --config /etc/zsched/fleet.yaml
+
     Refuses in another node's folder, and when a node that can be reached knows this name as an elector that has voted.
     A machine that has lost its state gets the fleet's document first: what `zsched fleet export` writes on a living
     node, as its fleet file. Where too many states are lost to agree, `zsched fleet recover --generation` begins anew.

@@ -158,6 +158,8 @@ def leave(
 ) -> int:
     """Take this machine out of its fleet: its tasks move away, its seat among the electors too, and its daemon ends.
 
+    Example: sudo zsched leave
+
     Nothing of the others' streams is lost; in a secured fleet they pause while the daemons begin again. Exits with 5 at
     the deadline: the leave stays in force, and the same command goes on with it; `zsched undrain NODE` takes it back.
     Another machine is taken out by `zsched node forget`.

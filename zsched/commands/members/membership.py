@@ -228,6 +228,8 @@ def create(
 ) -> int:
     """Make this machine the first one of a new fleet: writes its fleet file, state, authority and certificate.
 
+    Example: sudo zsched fleet create hall
+
     Refused where a fleet file or a state is. A fleet of one works; `zsched invite` brings the next machine.
     """
     node, where = places.node_name(here.node, os.environ), here.places()
@@ -329,6 +331,8 @@ def invite(
     ] = None,
 ) -> int:
     """Add a machine to the fleet, and write the file with which it joins (`zsched join`).
+
+    Example: sudo zsched invite edge2 --address 192.0.2.22 > edge2.invite
 
     In a secured fleet the file holds the machine's certificate, and its key unless --csr is given, where this machine
     has the authority.
@@ -515,6 +519,8 @@ def join(
     json_: JsonOption = False,
 ) -> int:
     """Make this machine the node that an invitation names: writes its fleet file, state and certificate.
+
+    Example: sudo zsched join edge2.invite
 
     With --request the machine makes its key by itself, and no key travels.
     Nothing of another fleet is touched: it is refused. Start the daemon then; it votes as soon as it hears the others.

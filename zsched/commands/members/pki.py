@@ -103,6 +103,8 @@ def init(
 ) -> int:
     """Make the fleet's authority: a key that signs certificates, on this machine only.
 
+    Example: sudo zsched pki init
+
     Refused where this machine trusts an authority already: that one is on another machine, and signs for the fleet.
     """
     from zsched.pki.authority import create  # noqa: PLC0415 - imports cryptography
@@ -139,6 +141,8 @@ def issue(
     out: OutOption = None,
 ) -> int:
     """Make the key and the first certificate of a node, an operator or a guest; it lasts 30 days.
+
+    Example: sudo zsched pki issue robot2
 
     Nodes may do what zsched does. An operator may also give commands from a machine that is no node. A guest reads
     status and streams.
@@ -209,6 +213,8 @@ def renew(
     runtime_dir: RuntimeOption = None,
 ) -> int:
     """Make new certificates for keys that have one. A certificate is due after two thirds of its life.
+
+    Example: sudo zsched pki renew --deliver
 
     With --deliver the nodes take them by themselves; the timer zsched-renew does that every day.
     """
@@ -335,7 +341,10 @@ def show(
     where: Where,
     json_: JsonOption = False,
 ) -> int:
-    """List every key that was certified: until when, and whether it is due, revoked or ended."""
+    """List every key that was certified: until when, and whether it is due, revoked or ended.
+
+    Example: sudo zsched pki show
+    """
     with _opened(where) as (office, authority):
         body = _as_json(office, authority)
     if json_:
@@ -356,7 +365,10 @@ def show(
 
 
 def revoke(where: Where, name: LabelArgument) -> int:
-    """Never certify a key again, and say which line of the fleet file keeps it out."""
+    """Never certify a key again, and say which line of the fleet file keeps it out.
+
+    Example: sudo zsched pki revoke robot2
+    """
     with _opened(where) as (office, authority):
         entry = authority.revoke(name, now_here())
         security = office.fleet.security
@@ -375,7 +387,10 @@ def rotate(
     where: Where,
     finish: Annotated[bool, typer.Option("--finish", help="Stop trusting the former authority.")] = False,
 ) -> int:
-    """Begin with a new authority. Both are trusted until --finish, which waits for every certificate to be renewed."""
+    """Begin with a new authority. Both are trusted until --finish, which waits for every certificate to be renewed.
+
+    Example: sudo zsched pki rotate
+    """
     with _opened(where) as (_, authority):
         if not finish:
             authority.rotate(passphrase_of(authority), now_here(), _lives(authority.record.fleet))

@@ -180,6 +180,8 @@ def recover_fleet(
 ) -> int:
     """Begin a new generation on one survivor when a majority of the electors is lost for good.
 
+    Example: sudo zsched fleet recover
+
     Tasks keep their newest values of all states that are given, under higher epochs. Its daemon must be stopped. It is
     refused while a majority of the electors can agree.
 

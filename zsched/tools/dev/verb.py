@@ -58,6 +58,8 @@ def dev(
 ) -> int:
     """Run every node of a fleet file on this machine, to try a task of your own; nothing of it stays.
 
+    Example: zsched dev my-task --task worker.py
+
     It prints where applications join, and starts a worker again when its file is saved. On a terminal keys move the
     task, kill its owner and load it.
     """

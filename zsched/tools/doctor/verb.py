@@ -38,6 +38,8 @@ def doctor(
 ) -> int:
     """Look for what is wrong with this machine, its daemon, or the whole fleet, and say what to do.
 
+    Example: sudo zsched doctor --fleet
+
     Each check says PASS, WARN, FAIL or SKIP, and what it saw. It changes nothing. Exits with 1 on a FAIL.
     """
     scene = look(here.machine(), is_fleet=fleet)

@@ -631,6 +631,8 @@ def rehearse(
 ) -> int:
     """Play faults on the running fleet, one at a time, and tell what it makes of them beside what is promised.
 
+    Example: zsched rehearse map_merge --plan
+
     It asks first, needs a second fit candidate, waits for calm before each step, and stops at the first broken promise.
     Exits with 1 when one was broken, with 5 when it could not go on.
     """

@@ -57,6 +57,8 @@ def record(
 ) -> int:
     """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps, tf.
 
+    Example: zsched record --output run.mcap
+
     Needs the extra mcap. Maps and frames on ROS topics are found by their type.
     """
     maps, frames = tuple(map_ or ()), tuple(tf or ())

@@ -158,5 +158,8 @@ def top(
     interval: Annotated[float, typer.Option(min=0.2, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
     no_color: NoColorOption = False,
 ) -> int:
-    """Show the fleet on the full screen: nodes, utilities over time, streams, the last moves; q ends."""
+    """Show the fleet on the full screen: nodes, utilities over time, streams, the last moves; q ends.
+
+    Example: zsched top
+    """
     return show_top(TopView(find=asked.door, is_plain=no_color, interval_s=interval), is_once=once)

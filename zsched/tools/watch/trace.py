@@ -48,6 +48,8 @@ def trace(
 ) -> int:
     """Send a trace span for each move in this machine's decision log to an OpenTelemetry collector.
 
+    Example: zsched trace --since 1d
+
     Needs the extra trace. Exits with 1 when the collector refused one.
     """
     if not _is_collector(otlp):

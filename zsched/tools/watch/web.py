@@ -65,6 +65,8 @@ def web(
 ) -> int:
     """Serve a page that shows the fleet live, and Prometheus' figures under /metrics; it changes nothing.
 
+    Example: zsched web
+
     It asks one daemon once a second, however many look; a daemon that is not there is waited for.
     """
     address, port = endpoint_of(listen)
