@@ -14,6 +14,8 @@ and its fleet file is without the keys of ``scheduling:`` that it ``--lacks``.
 * wake-ups: voluntary context switches a second, of all threads.
 * PSS: pages that processes share count in parts. A node alone on its machine shares with nobody; ``uss`` is the part
   that is its own.
+* alone: what daemon and relay would take on a machine of their own: the pages that are one's own, and what they share
+  with others once.
 * packets, bytes: what leaves a node's interface for other nodes; between processes of one node: ``local``.
 
 ``--threads`` adds CPU and wake-ups by group of threads, ``--packets`` what the packets of one robot and one edge are.
@@ -88,12 +90,13 @@ class Usage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traffic:
-    """What one node sent a second: to other nodes, and between its own processes."""
+    """What one node sent a second: to other nodes, and between its own processes; what it takes of memory, in MiB."""
 
     packets: float
     bytes: float
     local_packets: float
     local_bytes: float
+    alone: float
 
 
 class TreeBed(Netbed):
@@ -145,6 +148,22 @@ def memory(pid: int) -> tuple[float, float]:
     rollup = dict(line.split(":") for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:])
     parts = {name: int(text.split()[0]) / KIB_PER_MIB for name, text in rollup.items()}
     return parts["Pss"], parts["Private_Clean"] + parts["Private_Dirty"]
+
+
+def alone(pids: Sequence[int]) -> float:
+    """MiB of processes as on a machine of their own: pages of one's own, and of each shared mapping the larger part."""
+    own, shared = 0, Counter[tuple[str, ...]]()
+    for pid in pids:
+        mapping = ("", "")
+        for words in map(str.split, Path(f"/proc/{pid}/smaps").read_text().splitlines()):
+            if not words[0].endswith(":"):
+                mapping = words[2], words[-1]  # its offset in the file
+            elif words[0].startswith("Private_") and words[-1] == "kB":
+                own += int(words[1])
+            elif words[0] in ("Shared_Clean:", "Shared_Dirty:"):
+                part = (*mapping, words[0])
+                shared[part] = max(shared[part], int(words[1]))
+    return (own + shared.total()) / KIB_PER_MIB
 
 
 def sent(bed: Netbed, node: NodeId) -> tuple[int, int, int, int]:
@@ -208,7 +227,10 @@ def measure(bed: Netbed, owner: NodeId, seconds: float) -> tuple[list[Usage], li
     traffic = []
     for node in bed.names:
         rates = [(new - old) / took for new, old in zip(sent_after[node], sent_before[node], strict=True)]
-        traffic.append(Traffic(packets=rates[0], bytes=rates[1], local_packets=rates[2], local_bytes=rates[3]))
+        own = alone([one.pid for one in found if one.node == node and one.kind in {"daemon", "relay"}])
+        traffic.append(
+            Traffic(packets=rates[0], bytes=rates[1], local_packets=rates[2], local_bytes=rates[3], alone=own)
+        )
     return usages, traffic
 
 
@@ -263,12 +285,12 @@ def rows(nodes: int, name: str, usages: list[Usage], traffic: list[Traffic]) -> 
         }
         if kind in {"daemon", "relay"}:
             node.update({name: round(1000 * value) for name, value in figures.items()})
-        lines.append(_row(nodes, name, kind, figures) + " | | |")
+        lines.append(_row(nodes, name, kind, figures) + " | | | |")
     packets, size = mean([one.packets for one in traffic]), mean([one.bytes for one in traffic])
     local = mean([one.local_packets for one in traffic])
     lines.append(
         _row(nodes, name, "daemon + relay", {name: value / 1000 for name, value in node.items()})
-        + f" {packets:.0f} | {size / 1000:.1f} | {local:.0f} |"
+        + f" {packets:.0f} | {size / 1000:.1f} | {local:.0f} | {mean([one.alone for one in traffic]):.1f} |"
     )
     return lines
 
@@ -335,8 +357,8 @@ def main() -> None:
                 + " |"
             )
     print(
-        "| nodes | tree | process | CPU % | wake-ups/s | threads | PSS MiB | USS MiB | packets/s | kB/s | local |",
-        "| ---: | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| nodes | tree | process | CPU % | wake-ups/s | threads | PSS | USS | packets/s | kB/s | local | alone |",
+        "| ---: | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
         *tables,
         sep="\n",
     )
