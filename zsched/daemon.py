@@ -35,6 +35,7 @@ from zsched.core.values.in_force import InForce
 from zsched.core.values.model import NodeId, NodeKind
 from zsched.core.values.problems import Problem
 from zsched.core.values.snapshot import Exposure
+from zsched.core.values.startup import Startup
 from zsched.core.values.struct import Struct
 from zsched.host import paths as places
 from zsched.host import zenoh_log
@@ -203,18 +204,20 @@ class Daemon:
             electorate=electorate_hash(self._fleet),
             rng=random.Random(f"{self._spec.name}/{incarnation}"),
             now=monotonic_s(),
-            version=__version__,
+            startup=Startup(
+                version=__version__,
+                fleet_path=str(self._options.config.absolute()),
+                copied_file=copied_file(self._options.state_dir),
+                joins_at=joins_at(self._spec, points.worker_connect[:1]),
+                security=self._exposure(points),
+                no_state=restored.no_state,
+            ),
             stored=stored.fleets,
             flags=stored.flags,
         )
         node.solitude.dialled = points.control_connect
         node.solitude.dialled_at = self._spec.control_at
-        node.joins_at = joins_at(self._spec, points.worker_connect[:1])
-        node.has_foreign_state = restored.is_foreign
-        node.has_others_state, node.lacks_state_file = restored.is_others, restored.is_missing
-        node.fleet_path = str(self._options.config.absolute())
         node.by_file = self._in_file
-        node.copied_file = copied_file(self._options.state_dir)
         if restored.is_unsaved:
             node.agreement.on_persist_failed(restored.problem or "")
         elif restored.problem is not None:
@@ -223,7 +226,6 @@ class Daemon:
             log.warning("shared_memory off why=%s", self._memory_objection)
             node.set_problem("shared_memory", f"shared memory is off here: {self._memory_objection}")
         node.set_problem("tls", daemon_tls.plain_text_problem(self._spec, self._protocol) or None)
-        node.security = self._exposure(points)
         return node
 
     def _exposure(self, points: Endpoints) -> Exposure:

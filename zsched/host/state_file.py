@@ -25,6 +25,7 @@ from zsched.core.values.codec import decode_state, encode_state
 from zsched.core.values.durable import DurableState
 from zsched.core.values.errors import AdapterError, WireError
 from zsched.core.values.model import MAX_COUNTER, NodeId
+from zsched.core.values.startup import NoState
 from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import way_out
 from zsched.host.files import read_regular
@@ -49,10 +50,8 @@ class LoadResult(Struct, frozen=True, kw_only=True):
 
     state: DurableState | None = None
     problem: str | None = None
-    is_missing: bool = False
-    """There is no such file: this node was never initialised, or its folder is gone."""
-    is_others: bool = False
-    """It is whole, and another fleet's or node's: `zsched init` refuses it."""
+    no_state: NoState | None = None
+    """`NoState.ANOTHER_NODE`: `zsched init` refuses it."""
 
 
 class StateFile:
@@ -183,7 +182,7 @@ class StateFile:
             return LoadResult(problem=f"{self.path} {problem}")
         own = f"the fleet file of {state.fleet}" if state.fleet != self._fleet else f"--node {state.node}"
         advice = f"start this daemon with {own}, or take this machine out of that fleet first (`zsched leave`)"
-        return LoadResult(problem=f"{self.path} {problem}: {advice}", is_others=True)
+        return LoadResult(problem=f"{self.path} {problem}: {advice}", no_state=NoState.ANOTHER_NODE)
 
     def save(self, state: DurableState) -> None:
         """Replace the state; when this returns it survives a power cut.
@@ -232,7 +231,7 @@ class StateFile:
             content = read_regular(self.path, MAX_STATE_BYTES)
         except FileNotFoundError:
             advice = "if this name has never voted, stop the daemon, run `zsched init`, and start it again"
-            return LoadResult(problem=f"{self.path} does not exist: {advice}", is_missing=True)
+            return LoadResult(problem=f"{self.path} does not exist: {advice}", no_state=NoState.MISSING)
         except OSError as error:
             return LoadResult(problem=f"{self.path} cannot be read: {error.strerror}")
         try:

@@ -15,6 +15,7 @@ from zsched.core.values.durable import DurableState
 from zsched.core.values.errors import AdapterError, ConfigError
 from zsched.core.values.fleet import Fleet, electorate_hash
 from zsched.core.values.model import NodeId
+from zsched.core.values.startup import NoState
 from zsched.core.values.struct import Struct, field, replace
 from zsched.host.clock import wall_tenths
 from zsched.host.state_file import LoadResult, StateFile
@@ -34,12 +35,7 @@ class Restored(Struct, frozen=True, kw_only=True):
     """The disk refuses this life: by the state it is known what was agreed, and this node is no elector."""
     problem: str | None = None
     """Why there is no state, or why it is not saved."""
-    is_foreign: bool = False
-    """It was made with another electorate than the fleet file names."""
-    is_others: bool = False
-    """It is another node's, or another fleet's."""
-    is_missing: bool = False
-    """There is no state file."""
+    no_state: NoState | None = None
 
 
 def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, state_dir: Path) -> Restored:
@@ -51,11 +47,9 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
     incarnation = _next_life(state_file, loaded)
     if loaded.state is None:
         command = f"zsched init --config {config} --node {node} --state-dir {state_dir}"
-        advice = "" if loaded.is_others else f" (here: `{command}`)"
+        advice = "" if loaded.no_state is NoState.ANOTHER_NODE else f" (here: `{command}`)"
         log.warning("no_state why=%s%s; no elector", loaded.problem, advice)
-        return Restored(
-            incarnation=incarnation, problem=loaded.problem, is_others=loaded.is_others, is_missing=loaded.is_missing
-        )
+        return Restored(incarnation=incarnation, problem=loaded.problem, no_state=loaded.no_state)
     if loaded.state.electorate != electorate_hash(fleet) and not _is_agreed(loaded.state):
         generation = loaded.state.generation + 1
         why = (
@@ -64,7 +58,7 @@ def restore(state_file: StateFile, fleet: Fleet, *, config: Path, node: NodeId, 
             f"{generation} --force` on each, and start all"
         )
         log.warning("other_electorate %s", why)
-        return Restored(incarnation=incarnation, problem=why, is_foreign=True)
+        return Restored(incarnation=incarnation, problem=why, no_state=NoState.ANOTHER_ELECTORATE)
     state = replace(loaded.state, incarnation=incarnation, disk=loaded.state.disk or secrets.token_hex(8))
     try:
         state_file.save(state)
@@ -81,7 +75,7 @@ def _next_life(state_file: StateFile, loaded: LoadResult) -> int:
     a robot without a battery-backed clock starts in the past. Not just one more than the last one: a folder that was
     brought back from a backup must not live one of its lives again.
     """
-    if loaded.is_others:  # its lives are not ours to count
+    if loaded.no_state is NoState.ANOTHER_NODE:  # its lives are not ours to count
         return wall_tenths()
     last = max(state_file.last_life(), 0 if loaded.state is None else loaded.state.incarnation)
     incarnation = max(last + 1, wall_tenths())

@@ -17,6 +17,7 @@ from support.fleets import tuning_of
 from support.states import state_of
 from zsched.core.values.errors import AdapterError
 from zsched.core.values.model import Acceptance, RegisterState
+from zsched.core.values.startup import NoState
 from zsched.host.state_file import NEW_NAME, StateFile, hardware_id, is_same_hardware
 
 BALLOT = ballot_of(3, incarnation=2)
@@ -55,7 +56,7 @@ def test_missing_state_is_a_value_with_advice(tmp_path: Path) -> None:
     assert result.state is None
     assert result.problem is not None
     assert "stop the daemon, run `zsched init`" in result.problem
-    assert result.is_missing
+    assert result.no_state is NoState.MISSING
 
 
 def test_create_refuses_an_existing_state_unless_the_generation_rises(tmp_path: Path) -> None:
@@ -93,8 +94,9 @@ def test_state_of_somebody_else_is_lost_state(tmp_path: Path, fleet: str, node: 
     assert result.state is None
     assert result.problem is not None
     assert word in result.problem
-    assert result.is_others is ("`zsched leave`" in result.problem) is (word != "another machine")
-    assert not result.is_missing, "it is lost"
+    is_others = result.no_state is NoState.ANOTHER_NODE
+    assert is_others is ("`zsched leave`" in result.problem) is (word != "another machine")
+    assert result.no_state is not NoState.MISSING, "it is lost"
 
 
 def test_unreadable_state_is_a_value(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from support.fleets import fleet_of
 from support.states import state_of
 from zsched.core.values.errors import AdapterError
 from zsched.core.values.fleet import electorate_hash
+from zsched.core.values.startup import NoState
 from zsched.host.state_file import LIFE_NAME, StateFile
 from zsched.runtime import restoring
 from zsched.runtime.restoring import Restored, restore
@@ -35,7 +36,7 @@ def test_without_a_state_a_start_with_an_early_clock_is_a_later_life(
 ) -> None:
     """In a lower one the others would refuse all that it signs, its votes among it."""
     first = start(tmp_path, monkeypatch, 5000)
-    assert (first.state, first.is_missing, first.incarnation) == (None, True, 5000)
+    assert (first.state, first.no_state, first.incarnation) == (None, NoState.MISSING, 5000)
     assert start(tmp_path, monkeypatch, 40).incarnation == 5001
     assert start(tmp_path, monkeypatch, 6000).incarnation == 6000
 
@@ -55,13 +56,13 @@ def test_a_state_that_was_lost_or_comes_back_begins_no_lower_life(
     assert again.state.incarnation == 7003
     save(tmp_path, 9000, "another one's")
     foreign = start(tmp_path, monkeypatch, 40)
-    assert (foreign.is_foreign, foreign.incarnation) == (True, 9001)
+    assert (foreign.no_state, foreign.incarnation) == (NoState.ANOTHER_ELECTORATE, 9001)
 
 
 def test_another_node_s_folder_is_left_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     save(tmp_path, 7000)
     found = start(tmp_path, monkeypatch, 40, "robot2")
-    assert (found.is_others, found.incarnation) == (True, 40)
+    assert (found.no_state, found.incarnation) == (NoState.ANOTHER_NODE, 40)
     assert not (tmp_path / LIFE_NAME).exists()
 
 

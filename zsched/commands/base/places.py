@@ -1,7 +1,5 @@
 """Where this machine's things are: values of paths that verbs pass on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from zsched.core.values.model import NodeId

@@ -33,6 +33,7 @@ from zsched.core.values.electorate import FleetValue
 from zsched.core.values.errors import AdapterError, ConfigError, WireError, ZschedError
 from zsched.core.values.fleet import Fleet, fleet_hash
 from zsched.core.values.model import NodeId, RegisterState
+from zsched.core.values.startup import NoState
 from zsched.core.values.struct import Struct, replace
 from zsched.core.vote.generations import blank_state
 from zsched.host import decision_log, rehearsals
@@ -213,7 +214,7 @@ def is_joined(invitation: Invitation, places: Places) -> bool:
     file = StateFile(places.state, fleet=invitation.fleet, node=invitation.node)
     file.check_owner("or take this machine out of its fleet first (`zsched leave`)")
     loaded = file.load()
-    if loaded.is_missing:
+    if loaded.no_state is NoState.MISSING:
         return False
     state = loaded.state
     register = None if state is None else state.fleet_register
@@ -746,7 +747,7 @@ def _read(text: str, config: Path) -> Fleet:
 def _check_no_state(fleet: str, node: NodeId, folder: Path) -> None:
     file = StateFile(folder, fleet=fleet, node=node)
     file.check_owner("or take this machine out of its fleet first (`zsched leave`)")
-    if not file.load().is_missing:
+    if file.load().no_state is not NoState.MISSING:
         advice = "leave that fleet first (`zsched leave`), or give a folder with --state-dir"
         raise AdapterError(f"{file.path} exists already: this machine belongs to a fleet; {advice}")
 

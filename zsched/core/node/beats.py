@@ -19,6 +19,7 @@ from zsched.core.values import instructions as do
 from zsched.core.values.beat import Beat
 from zsched.core.values.model import NodeId, PeerState
 from zsched.core.values.problems import Problem
+from zsched.core.values.startup import NoState
 from zsched.core.values.todo import ToDo
 
 # --- sent ------------------------------------------------------------------------------------------------------------
@@ -56,7 +57,7 @@ def send_beat(node: Stages, todo: ToDo, now: float) -> None:
         has_lost_state=node.me in node.agreement.electors and not node.agreement.is_elector,
         electorate=node.agreement.electorate if node.agreement.is_elector else "",
         twins=node.namesakes.names(now),
-        lacks_state_file=node.me in node.agreement.electors and node.lacks_state_file,
+        lacks_state_file=node.me in node.agreement.electors and node.startup.no_state is NoState.MISSING,
         disk=node.agreement.disk,
         gone=gone,
         away=away,
@@ -175,7 +176,7 @@ def _on_beat(node: Stages, event: ev.BeatReceived, todo: ToDo, now: float) -> No
     if node.renewing.told:
         node.renewing.hear(beat.node, beat.fleet_file, now)
     if beat.fleet_file != node.fleet_file or node.problems:
-        told = node.identity.file_complaint(beat, node.fleet_path, is_agreed=bool(node.agreement.document_hash))
+        told = node.identity.file_complaint(beat, node.startup.fleet_path, is_agreed=bool(node.agreement.document_hash))
         node.set_problem(Problem.FLEET, told, beat.node)
     _hear_leases(node, beat, todo, now, is_newest=node.membership.is_newest(beat.node))
 

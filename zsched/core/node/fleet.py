@@ -138,11 +138,11 @@ def compare_file(node: Stages) -> None:
     """
     agreed = node.agreement.document
     complaint = None
-    if agreed is not None and node.by_file not in (file_hash(agreed), node.copied_file):
+    if agreed is not None and node.by_file not in (file_hash(agreed), node.startup.copied_file):
         complaint = (
             f"the fleet file here differs from the agreed document, by which this node goes; what it would change: "
-            f"`zsched apply {node.fleet_path} --plan`; to take the document: "
-            f"`zsched fleet export -o {node.fleet_path}`, then `systemctl reload zsched` (SIGHUP)"
+            f"`zsched apply {node.startup.fleet_path} --plan`; to take the document: "
+            f"`zsched fleet export -o {node.startup.fleet_path}`, then `systemctl reload zsched` (SIGHUP)"
         )
     node.set_problem(Problem.OWN_FILE, complaint)
 

@@ -54,6 +54,7 @@ from zsched.core.values.plan import StreamCount, WorkerRole
 from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.profile import Profile, WorkerState
 from zsched.core.values.recent import RecentWorst
+from zsched.core.values.startup import Startup
 from zsched.core.values.struct import Struct
 from zsched.core.values.todo import ToDo
 from zsched.core.values.veto import Veto
@@ -68,6 +69,9 @@ LAG_SHOWN_S: Final = 30.0
 """A delay of the loop is shown for so long: who looks at the status never comes in the moment of one."""
 HISTORY = 32
 """Past values of a task that status can show."""
+
+
+_NOTHING_FOUND: Final = Startup()
 
 
 class PastValue(Struct, frozen=True, kw_only=True):
@@ -103,25 +107,11 @@ class Stages:
         electorate: hash of the electorate in force.
         rng: seeded by the shell; the only source of chance.
         now: monotonic seconds.
-        version: of the program, for status.
+        startup: what the daemon found on its machine.
         stored: {hash: what it says} of the documents on this node's disk that its state names.
         flags: {hash: its flags} of those of them that have any.
     """
 
-    has_foreign_state = False
-    """The state file is whole, and of another electorate than the fleet file: it stays on its disk."""
-    has_others_state = False
-    """The state file is whole, and another fleet's or node's, of whose electors it says nothing here."""
-    lacks_state_file = False
-    """There is none at all, rather than one that cannot be used."""
-    fleet_path = ""
-    """Where the fleet file lies, for the status."""
-    copied_file = ""
-    """Hash of the file that was written here as a copy of an earlier document; empty: it is the operator's own."""
-    joins_at: tuple[str, ...] = ()
-    """Where applications on this machine join its streams, for the status."""
-    security = ""
-    """Who is let in to this node's sessions, for the status (`Exposure`)."""
     is_draining = False
     loop_lag_s = 0.0
     """The longest delay since the last beat, for the beat; `recent_lag` is what the status shows."""
@@ -147,13 +137,13 @@ class Stages:
         electorate: str,
         rng: Random,
         now: float,
-        version: str = "",
+        startup: Startup = _NOTHING_FOUND,
         stored: Mapping[str, Fleet] = MappingProxyType({}),
         flags: Mapping[str, tuple[Flag, ...]] = MappingProxyType({}),
     ) -> None:
         self.in_force = InForce(known_at_start(fleet, durable, stored))
         fleet = self.fleet
-        self.me, self.version = me, version
+        self.me, self.startup = me, startup
         self.kind = fleet.node(me).kind
         self.incarnation = incarnation
         self.started_at = now

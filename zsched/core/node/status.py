@@ -41,6 +41,7 @@ from zsched.core.values.snapshot import (
     TaskStatus,
     VoteStatus,
 )
+from zsched.core.values.startup import NoState
 from zsched.core.values.struct import replace
 from zsched.core.values.veto import Filter
 from zsched.core.values.words import Trouble, shown, told_of_worker
@@ -76,11 +77,11 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         *_overloads(node, now),
         *_disk_problems(node),
         *_relay_problems(node, now),
-        *told_of(node.knocking.problems(now, node.fleet_path, is_agreed=bool(node.agreement.document_hash))),
+        *told_of(node.knocking.problems(now, node.startup.fleet_path, is_agreed=bool(node.agreement.document_hash))),
     )
     return Snapshot(
         schema=SCHEMA,
-        version=node.version,
+        version=node.startup.version,
         fleet=node.fleet.name,
         node=node.me,
         kind=node.kind.value,
@@ -93,12 +94,12 @@ def build_snapshot(node: Stages, now: float) -> Snapshot:
         fleet_file=node.text_hash,
         fleet_revision=node.agreement.fleet_revision,
         document=node.agreement.document_hash,
-        joins_at=node.joins_at,
+        joins_at=node.startup.joins_at,
         counters=tuple(sorted((node.counters + node.agreement.counters).items())),
         frames_dropped_s=now - max(node.dropped_at.values()) if node.dropped_at else None,
         dropped_ages=tuple(sorted((name, now - at) for name, at in node.dropped_at.items())),
         refused=node.refused_keys.told(node.fleet, now),
-        security=node.security,
+        security=node.startup.security,
         order_s=node.fleet.timing.order_s,
         problems=problems,
         problem_kinds=kinds,
@@ -184,10 +185,10 @@ def _problems(node: Stages, quorum: QuorumStatus, now: float) -> list[Told]:
             f"no planned moves: {len(voters) - len(silent)} of {len(voters)} robots can vote, {needed} needed; "
             f"not {told}. {replaced}"
         )
-    if not has_enough and not node.has_others_state:
+    if not has_enough and node.startup.no_state is not NoState.ANOTHER_NODE:
         problems.append((Problem.NOTHING_AGREED, _nothing_agreed(node, quorum, fresh, now)))
     problems += _behind(node, now)
-    if not node.has_state and not node.has_foreign_state and not node.has_others_state:
+    if not node.has_state and node.startup.no_state in (None, NoState.MISSING):
         problems.append("no valid state file: this node is no elector (see `zsched init --help`)")
     return problems
 
@@ -251,7 +252,7 @@ def _never_had_one(node: Stages, quorum: QuorumStatus) -> list[NodeId]:
     """The electors on which `init` was only forgotten, as far as is known: no file, no vote that anybody remembers."""
     if node.agreement.newest_generation:
         return []
-    fileless = node.fileless.keys() | ({node.me} if node.lacks_state_file else set())
+    fileless = node.fileless.keys() | ({node.me} if node.startup.no_state is NoState.MISSING else set())
     return [name for name in quorum.stateless if name in fileless and name not in node.agreement.voted]
 
 
@@ -292,7 +293,7 @@ def _why_refused(node: Stages, name: NodeId) -> str:
 def _is_never_initialised(node: Stages, quorum: QuorumStatus) -> bool:
     """Whether too many electors lack a state, none is known to have one, and no node remembers that one ever had."""
     agreement, electors = node.agreement, node.fleet.electors
-    if node.me in electors and not node.lacks_state_file:
+    if node.me in electors and node.startup.no_state is not NoState.MISSING:
         return False
     is_remembered = agreement.newest_generation or agreement.voted or agreement.problems or quorum.apart
     if is_remembered or any(register.value.revision for register in node.registers.values()):
@@ -348,7 +349,7 @@ def _quorum(node: Stages) -> QuorumStatus:
     stateless = [name for name in electors if _has_lost_state(node, name)]
     alive = _answering(node)
     needed = majority(len(electors))
-    lost = "other_electorate" if node.has_foreign_state else "lost_state"
+    lost = "other_electorate" if node.startup.no_state is NoState.ANOTHER_ELECTORATE else "lost_state"
     role = "elector" if node.agreement.is_elector else (lost if node.me in electors else "no_elector")
     return QuorumStatus(
         electors=len(electors),

@@ -42,11 +42,6 @@ def fault(expr: str) -> str | None:
     return None
 
 
-def is_valid(expr: str) -> bool:
-    """True when ``expr`` is a valid canonical key expression."""
-    return fault(expr) is None
-
-
 def is_wild(expr: str) -> bool:
     """True when ``expr`` (valid) stands for more than one key."""
     return "*" in expr

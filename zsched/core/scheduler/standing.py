@@ -128,11 +128,6 @@ def _with_margin(vector: UtilityVector) -> UtilityVector:
     return replace(vector, utilities=tuple(near))
 
 
-def mean(utilities: Sequence[float]) -> float:
-    """How robots' utilities become one (Eq. 5-6)."""
-    return math.fsum(utilities) / len(utilities)
-
-
 def _comparable(candidates: Iterable[NodeId], rows: Sequence[_Row]) -> Sequence[_Row]:
     """The rows that these candidates are compared by: of the robots that score all of them, if they are a majority.
 
@@ -145,8 +140,10 @@ def _comparable(candidates: Iterable[NodeId], rows: Sequence[_Row]) -> Sequence[
 
 
 def _aggregates(candidates: list[NodeId], rows: Sequence[_Row]) -> dict[NodeId, float]:
+    """{candidate: the mean of the robots' utilities} (Eq. 5-6)."""
     told = _comparable(candidates, rows)
-    return {name: mean([row[name].value for row in told if name in row]) for name in candidates}
+    columns = {name: [row[name].value for row in told if name in row] for name in candidates}
+    return {name: math.fsum(column) / len(column) for name, column in columns.items()}
 
 
 def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:

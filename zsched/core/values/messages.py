@@ -107,7 +107,6 @@ class Refusal(StrEnum):
     NOT_ELECTOR = "not_elector"  # it is none, or lost its state
     LEASE = "lease"  # an exclusive task's grant is still running
     RATE = "rate"  # this proposer asks too often
-    DISK = "disk"  # it could not persist
     VALUE = "value"  # it does not take this value for a true one: its fleet file knows no such node
     DOCUMENT = "document"  # it has not stored the document of this fleet value yet
     NUMBER = "number"  # it counts by another number of the fleet value, or has no such register

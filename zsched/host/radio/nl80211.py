@@ -59,7 +59,6 @@ class Attr(IntEnum):
 
     IFINDEX = 3
     IFNAME = 4
-    IFTYPE = 5
     MAC = 6
     STA_INFO = 21
     PS_STATE = 93
@@ -72,9 +71,7 @@ class StationInfo(IntEnum):
     TX_BITRATE = 8
     TX_PACKETS = 10
     TX_RETRIES = 11
-    TX_FAILED = 12
     SIGNAL_AVG = 13
-    RX_BITRATE = 14
 
 
 class RateInfo(IntEnum):
@@ -110,10 +107,8 @@ class Station(Struct, frozen=True, kw_only=True):
     mac: str
     signal_dbm: float | None = None
     tx_mbps: float | None = None
-    rx_mbps: float | None = None
     tx_packets: int | None = None
     tx_retries: int | None = None
-    tx_failed: int | None = None
 
 
 # --- bytes to values -------------------------------------------------------------------------------------------------
@@ -169,10 +164,8 @@ def parse_station(payload: bytes) -> Station:
         mac=mac.hex(":"),
         signal_dbm=_signal(info, StationInfo.SIGNAL_AVG) if signal_dbm is None else signal_dbm,
         tx_mbps=_bitrate(info, StationInfo.TX_BITRATE),
-        rx_mbps=_bitrate(info, StationInfo.RX_BITRATE),
         tx_packets=_unsigned(info, StationInfo.TX_PACKETS),
         tx_retries=_unsigned(info, StationInfo.TX_RETRIES),
-        tx_failed=_unsigned(info, StationInfo.TX_FAILED),
     )
 
 

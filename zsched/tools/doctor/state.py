@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from zsched.core.values.fleet import electorate_hash
+from zsched.core.values.startup import NoState
 from zsched.host.clock import monotonic_s
 from zsched.host.paths import is_there
 from zsched.host.state_file import StateFile
@@ -37,9 +38,9 @@ def valid(scene: Scene) -> Result:
     told, role = found.problem or "no state", "an elector" if scene.node in scene.fleet.electors else "no elector"
     first = "before it, if the state was lost, bring what `zsched fleet export` writes on a living node as that file"
     fix = f"sudo zsched init --config {scene.file} --node {scene.node}, with the daemon stopped; {first}"
-    if not found.is_missing:
+    if found.no_state is not NoState.MISSING:
         fix = "zsched fleet recover --help says how a node becomes an elector again; do not copy a state from elsewhere"
-    if found.is_others:
+    if found.no_state is NoState.ANOTHER_NODE:
         fix = "the fleet file and name of that state, or zsched leave; zsched init refuses here"
     if scene.node not in scene.fleet.electors:
         return warned(told, f"{scene.node} is {role}: it works without", fix=fix)

@@ -50,6 +50,7 @@ from zsched.core.values.model import Acceptance, Allocation, Asked, Ballot, Peer
 from zsched.core.values.plan import Direction, ReadyWhen, RoutePhase, StreamCount, WorkerRole
 from zsched.core.values.problems import Problem, ProblemKey
 from zsched.core.values.profile import Echo, WorkerLoad, WorkerState
+from zsched.core.values.startup import Startup
 from zsched.core.values.todo import ToDo
 from zsched.core.values.words import CREATION_STEP
 
@@ -755,7 +756,7 @@ def test_another_fleet_file_is_a_problem_until_it_is_the_same() -> None:
     assert node.problems["fleet", "robot2"].endswith(
         "restart no daemon: docs/guide/service.md, Add or remove a machine"
     )
-    node.fleet_path = "/etc/zsched/fleet.yaml"
+    node.startup = Startup(fleet_path="/etc/zsched/fleet.yaml")
     node.handle(ev.BeatReceived(beat=replace(strange, sequence=2)), 100.1)
     assert f"here {node.fleet_file} of /etc/zsched/fleet.yaml)" in node.problems["fleet", "robot2"]
     node.handle(ev.BeatReceived(beat=replace(beat("robot2", 3), fleet_file=node.fleet_file)), 100.2)

@@ -41,6 +41,7 @@ from zsched.core.values.problems import Problem
 from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.report import snapshot_json
 from zsched.core.values.snapshot import SCHEMA, Snapshot
+from zsched.core.values.startup import NoState, Startup
 from zsched.core.values.todo import ToDo
 from zsched.core.values.words import Trouble, told_of_worker
 from zsched.core.vote.agreement import Agreement
@@ -67,7 +68,7 @@ def make(me: str = "robot1", *, has_state: bool = True, alive: tuple[str, ...] =
         electorate=hashed,
         rng=Random(1),
         now=100.0,
-        version="1.2.3",
+        startup=Startup(version="1.2.3"),
     )
     for name in alive:
         if name != me:
@@ -208,7 +209,7 @@ def test_a_node_with_another_fleets_state_is_not_told_to_begin_anew() -> None:
         node.handle(ev.BeatReceived(beat=beat_of(name, sequence, incarnation=3, has_lost_state=True)), 100.0)
     node.problems["state", ""] = "/x/state belongs to the fleet 'yard', not 'hall': ... (`zsched leave`)"
     assert any("zsched init" in one for one in build_snapshot(node, 100.0).problems)
-    node.has_others_state = True
+    node.startup = Startup(no_state=NoState.ANOTHER_NODE)
     told = build_snapshot(node, 100.0).problems
     assert any("`zsched leave`" in one for one in told)
     assert not any("zsched init" in one for one in told)
@@ -246,7 +247,7 @@ def test_a_machine_that_was_taken_out_is_not_told_to_start_the_others() -> None:
 def forgotten(me: str = "robot1", *, lacks_file: bool = True, stateless: tuple[str, ...] = ROBOTS) -> Node:
     """A node of a fleet whose electors say that they have no state."""
     node = make(me, has_state=me not in stateless)
-    node.lacks_state_file = lacks_file
+    node.startup = Startup(no_state=NoState.MISSING if lacks_file else None)
     node.problems["state", ""] = "/x/state does not exist"
     for name in stateless:
         if name != me:
@@ -502,7 +503,7 @@ def test_problems_say_what_is_missing_in_words() -> None:
 
 def test_a_state_of_another_electorate_is_not_told_as_lost() -> None:
     node = make(has_state=False)
-    node.has_foreign_state = True
+    node.startup = Startup(no_state=NoState.ANOTHER_ELECTORATE)
     snapshot = build_snapshot(node, 100.0)
     assert snapshot.quorum.this_node == "other_electorate"
     assert not any("no valid state file" in one for one in snapshot.problems), snapshot.problems
@@ -630,7 +631,7 @@ def test_a_fleet_without_robots_says_that_nobody_votes() -> None:
         electorate=hashed,
         rng=Random(1),
         now=100.0,
-        version="1.2.3",
+        startup=Startup(version="1.2.3"),
     )
     assert build_snapshot(node, 100.0).problems == (
         "nobody votes: the fleet has no robot, so no task gets an owner; `zsched invite` brings one",
@@ -1108,7 +1109,7 @@ def test_a_node_tells_how_long_it_waits_for_the_end_of_an_order() -> None:
 
 def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     node = make()
-    node.joins_at = ("tcp/127.0.0.1:7458",)
+    node.startup = Startup(joins_at=("tcp/127.0.0.1:7458",))
     for now, dropped in ((100.0, 3), (110.0, 3), (120.0, 4), (190.0, 4)):
         count = StreamCount(stream="merge/in/0", drops=(("overflow", dropped),))
         once = StreamCount(stream="merge/in/2", drops=(("no_route", 1),))

@@ -114,9 +114,7 @@ def test_a_new_relay_tells_its_tokens_anew() -> None:
 
 
 def test_a_node_doubts_a_peer_that_was_gone_and_is_back() -> None:
-    node = Node(
-        fleet=FLEET, me="edge2", durable=None, incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
-    )
+    node = Node(fleet=FLEET, me="edge2", durable=None, incarnation=7, electorate="e", rng=Random(1), now=100.0)
     on_transition(
         node, Transition(node="edge1", before=PeerState.SUSPECT, after=PeerState.GONE, reason="silent"), ToDo(), 100.0
     )

@@ -52,9 +52,7 @@ def elector() -> Agreement:
 
 def elector_node() -> Node:
     """The same elector in its node."""
-    node = Node(
-        fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0, version="t"
-    )
+    node = Node(fleet=FLEET, me="robot1", durable=disk(), incarnation=7, electorate="e", rng=Random(1), now=100.0)
     node.start(100.0)
     for name in ROBOTS[1:]:
         node.agreement.witness.on_answer(Learnt(node=name, values=()))
