@@ -146,7 +146,7 @@ def the_tour(port: int) -> list[Step]:
         "undrain edge2 --yes",
         "restart echo --yes",
         "logs echo",
-        "wait --for healthy --timeout 30",
+        "wait --until healthy --timeout 30",
         "doctor",
         "doctor --fleet",
         "rehearse echo --steps move,drain --yes",
@@ -249,7 +249,7 @@ def found_fleet(hall: Hall, port: int) -> None:
         invitation.write_text(patiently(hall, "invite", name, *where, "--yes"))
         hall.zsched(name, "join", str(invitation))
         hall.start(name)
-    patiently(hall, "wait", "--for", "healthy", "--timeout", "60")
+    patiently(hall, "wait", "--until", "healthy", "--timeout", "60")
     home = hall.folder / "robot1"
     (home / "fleet.yaml").write_text(patiently(hall, "fleet", "export"))
     (home / "second.yaml").write_text(OTHER_TASK)

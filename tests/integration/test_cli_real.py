@@ -255,7 +255,7 @@ def look_from_a_machine_without_a_daemon(folder: Path, here: Site, there: Site) 
     assert laptop.status("--connect", endpoint)["node"] == here.node, "the one at the endpoint"
     assert laptop.status("--connect", endpoint, "--node", there.node)["node"] == there.node
     for verb in (
-        ("wait", "--for", "settled=echo"),
+        ("wait", "--until", "settled=echo"),
         ("metrics", "print"),
         ("tune", "echo"),
         ("stream", "list", "--node", there.node, "--window", "0.2"),
@@ -279,7 +279,7 @@ def test_a_worker_is_restarted_through_another_node_and_what_it_prints_is_shown(
         for site in (robot, edge):
             assert site.zsched("init").returncode == 0
             stack.enter_context(site.up())
-        assert robot.zsched("wait", "--for", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
+        assert robot.zsched("wait", "--until", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
         assert robot.zsched("logs", "echo").stdout.count("it starts") == 1
         refused = robot.zsched("restart", "echo")
         assert (refused.returncode, "--yes" in refused.stderr) == (2, True)
@@ -288,7 +288,7 @@ def test_a_worker_is_restarted_through_another_node_and_what_it_prints_is_shown(
         end = time.monotonic() + UP_S
         while robot.zsched("logs", "echo", edge.node).stdout.count("it starts") < 2:
             assert time.monotonic() < end, robot.log()
-        assert robot.zsched("wait", "--for", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
+        assert robot.zsched("wait", "--until", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
         assert robot.zsched("logs", "echo", robot.node).returncode == 1
 
 
@@ -319,7 +319,7 @@ def test_a_paused_task_is_moved_by_order_and_every_node_says_who_did_it(tmp_path
         for site in (robot, edge1, edge2):
             assert site.zsched("init").returncode == 0
             stack.enter_context(site.up())
-        assert robot.zsched("wait", "--for", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
+        assert robot.zsched("wait", "--until", "settled=echo", "--timeout", f"{UP_S:g}").returncode == 0
         owner = robot.status()["tasks"][0]["owner"]
         there = edge1 if owner == edge2.node else edge2
         end = time.monotonic() + UP_S
@@ -401,7 +401,7 @@ def test_a_move_is_explained_remembered_and_judged_again(tmp_path: Path) -> None
         seen = robot.zsched("explain", "echo", "--robot", "robot1")
         assert seen.returncode == 0, seen.stderr
         assert "HEARS      robots robot1" in seen.stdout
-        told = robot.zsched("events", "--for", "task/echo", "--since", "1h")
+        told = robot.zsched("events", "--about", "task/echo", "--since", "1h")
         assert f"propose {newest}: {owner} is draining" in told.stdout
         assert "settled on" in told.stdout or "flipped to" in told.stdout
 

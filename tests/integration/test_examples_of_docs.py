@@ -110,7 +110,7 @@ def test_the_first_fleet_by_its_verbs_answers_its_application(tmp_path: Path) ->
     with Hall(tmp_path) as hall:
         hall.zsched("robot1", "fleet", "create", "hall", "--address", f"127.0.0.1:{port}")
         hall.start("robot1")
-        hall.zsched("robot1", "wait", "--for", "quorum", "--timeout", "30")
+        hall.zsched("robot1", "wait", "--until", "quorum", "--timeout", "30")
         hall.zsched("robot1", "task", "add", str(tmp_path / "echo.yaml"), "--yes")
         for count, (name, kind) in enumerate((("robot2", "robot"), ("edge1", "edge")), 1):
             words = ("--kind", kind, "--address", f"127.0.0.1:{port + 10 * count}", "--candidate-for", "echo", "--yes")
@@ -120,7 +120,7 @@ def test_the_first_fleet_by_its_verbs_answers_its_application(tmp_path: Path) ->
             until(lambda name=name: name in hall.alive("robot1"), f"{name} joins")  # type: ignore[misc]
         everybody = {"robot1", "robot2", "edge1"}
         until(lambda: all(hall.alive(name) == everybody for name in everybody), "all hear each other")
-        hall.zsched("robot1", "wait", "--for", "healthy", "--timeout", "60")
+        hall.zsched("robot1", "wait", "--until", "healthy", "--timeout", "60")
         joins_at = str(hall.status("robot1")["joins_at"][0])
         assert joins_at.endswith(f":{port + 3}"), "three ports behind its control session, as the page says"
         text = examples(page, "python")[0]

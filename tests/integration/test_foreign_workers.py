@@ -230,11 +230,11 @@ def test_a_worker_that_somebody_else_starts_is_seen_to_come_and_to_go(tmp_path: 
         return is_named and "no other candidate can take it" in problems
 
     fleet.bed.wait(told, 60, "status names the standby that is away")
-    said = command(fleet.bed, "wait", "--for", "healthy", "--timeout", "0")
+    said = command(fleet.bed, "wait", "--until", "healthy", "--timeout", "0")
     assert "healthy: not met" in said
     assert "no other candidate can take it" in said
     third = fleet.start_worker("edge2")
-    said = command(fleet.bed, "wait", "--for", "healthy", "--timeout", "50")
+    said = command(fleet.bed, "wait", "--until", "healthy", "--timeout", "50")
     assert "healthy: met" in said, said
     end(third)  # or it would get the task while the other one is away
 

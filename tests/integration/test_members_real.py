@@ -70,14 +70,14 @@ def test_a_fleet_grows_from_one_machine_and_shrinks_to_none_while_a_stream_runs(
         with zenoh.open(zenoh.Config.from_json5(client_config(connect=(f"tcp/127.0.0.1:{port + 1}",)))) as session:
             stream = Stream(session)
             until(lambda: matches(stream.publisher), "the relay subscribes")
-            hall.zsched("robot1", "wait", "--for", "healthy", "--timeout", "60")  # what comes before has no way yet
+            hall.zsched("robot1", "wait", "--until", "healthy", "--timeout", "60")  # what comes before has no way yet
             stream.start()
             until(lambda: len(stream.back) > 20, "a fleet of one does its task")
 
             for count, name in enumerate(("robot2", "robot3"), 1):
                 bring(hall, name, port + 10 * count)
             until(lambda: elects(hall, "robot1", "robot2", "robot3"), "one elector has become three")
-            hall.zsched("robot1", "wait", "--for", "healthy", "--timeout", "60")
+            hall.zsched("robot1", "wait", "--until", "healthy", "--timeout", "60")
             # robot1's fleet file is the copy of a document with robot1 alone
             assert "robot3" in hall.zsched("robot1", "ping", "robot3", "--count", "1", "--timeout", "20")
             assert "FAIL net.ports" not in hall.run("robot1", "doctor").stdout

@@ -84,7 +84,7 @@ def test_one_machine_becomes_nine_and_two_of_them_are_left(tmp_path: Path, netwo
         text = hall.zsched(FIRST, "fleet", "export").replace("tasks: {}\n", f"replace_s: {REPLACE_S:g}\n{TASK}")
         (tmp_path / "agreed.yaml").write_text(text)
         hall.zsched(FIRST, "apply", str(tmp_path / "agreed.yaml"), "--yes")
-        hall.zsched(FIRST, "wait", "--for", "healthy", "--timeout", "60")
+        hall.zsched(FIRST, "wait", "--until", "healthy", "--timeout", "60")
         config = zenoh_config.client_config(connect=(f"tcp/{network.address(FIRST)}:{DATA_PORT}",), timing=Timing())
         command = network.wrap(FIRST, [*PROBE, config, "--put", f"{FIRST}/in", "--hz", "20", "--watch", f"{FIRST}/out"])
         with (tmp_path / "probe.log").open("ab") as log:

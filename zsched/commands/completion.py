@@ -24,7 +24,7 @@ from zsched.host.operator_client import ask
 ANSWER_S: Final = 0.5
 """A daemon that does not answer so soon is not waited for: somebody holds the tab key."""
 CONDITIONS: Final = ("healthy", "quorum", "owner=", "settled=", "empty=")
-"""Of `zsched wait --for`."""
+"""Of `zsched wait --until`."""
 
 SCRIPTS: Final = {"bash": "zsched", "zsh": "_zsched", "fish": "zsched.fish"}
 """{shell: its script's file, called as the shell looks for it}."""

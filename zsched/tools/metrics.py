@@ -126,7 +126,7 @@ def _of_tasks(tasks: list[Json]) -> Iterator[Family]:
         (t["name"], name, value) for t in tasks if t["decision"] for name, value in t["decision"]["aggregates"].items()
     ]
     scores = [({"task": task, "node": name}, value) for task, name, value in joint]
-    yield "zsched_task_utility_ratio", "gauge", "Joint utility of a candidate in the last round.", scores
+    yield "zsched_task_utility_ratio", "gauge", "What a candidate was worth in the last round.", scores
     yield from _of_streams([(task["name"], stream) for task in tasks for stream in task["streams"]])
 
 

@@ -116,8 +116,8 @@ def test_verbs_that_only_show_load_no_values_and_no_scheduler() -> None:
 
 
 def by_formula(text: str, **terms: float) -> float:
-    """What a reader gets who puts a row's terms into the line UTILITY."""
-    found = re.search(r"^UTILITY +(.*)$", text, re.MULTILINE)
+    """What a reader gets who puts a row's terms into the line WORTH."""
+    found = re.search(r"^WORTH +(.*)$", text, re.MULTILINE)
     assert found is not None
     if " x " in found[1] or "^" in found[1]:
         parts = [one.partition("^") for one in found[1].split(" x ")]
@@ -141,7 +141,7 @@ def test_the_line_of_the_utility_is_what_the_core_reckons(score: str, said: str)
     utility = total_utility(
         weights, cpu=0.5, memory=0.8, network=None, measured=measured, form=form, gauges={"gpu": 0.9}
     )
-    assert by_formula(f"UTILITY    {told}", cpu=0.5, mem=0.8, gpu=0.9) == pytest.approx(utility)
+    assert by_formula(f"WORTH      {told}", cpu=0.5, mem=0.8, gpu=0.9) == pytest.approx(utility)
     assert formula_of({"tuning": tuning, "candidates": []}) == ""
 
 
@@ -251,7 +251,7 @@ def test_of_a_robot_that_does_not_answer_another_tells_what_it_heard(
     assert "HEARS" not in captured.out, "nobody knows whom it hears"
     assert "0.6250" in captured.out
     assert asked(robot="robot3") == 0
-    assert "robot1 has no utilities of robot3" in capsys.readouterr().out
+    assert "robot1 has no worth from robot3" in capsys.readouterr().out
 
 
 # --- a judgement of the past -----------------------------------------------------------------------------------------

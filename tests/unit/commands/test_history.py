@@ -262,7 +262,7 @@ def test_another_machine_tells_its_moves_and_refuses_its_events(
     pages: Pages, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = Door(socket=Path("s"), node="robot2")
-    with pytest.raises(CliError, match="lies on its machine: ask there; --for node/robot2") as refused:
+    with pytest.raises(CliError, match="lies on its machine: ask there; --about node/robot2") as refused:
         events(there)
     assert (refused.value.code, pages.asked) == (EXIT_USAGE, [])
     assert history(there, "merge", is_json=True) == 0

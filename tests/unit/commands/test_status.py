@@ -132,7 +132,7 @@ def test_every_verb_that_asks_a_daemon_takes_the_node_that_several_daemons_make_
     main = typer.main.get_command(app)
     assert isinstance(main, typer.core.TyperGroup)
     asking = [words for words, options in verbs(main) if "--runtime-dir" in options]
-    arguments = {"write": [str(folder / "x.prom")], "wait": ["--for", "quorum", "--timeout", "0"]}
+    arguments = {"write": [str(folder / "x.prom")], "wait": ["--until", "quorum", "--timeout", "0"]}
     arguments |= {
         "invite": ["edge9", "--plan"],
         "logs": ["echo"],

@@ -114,17 +114,17 @@ def run(*words: str) -> Result:
 
 
 def test_a_condition_that_holds_is_met_at_once(daemon: Daemon) -> None:
-    result = run("--for", "owner=echo@edge1")
+    result = run("--until", "owner=echo@edge1")
     assert result.exit_code == 0
     assert re.fullmatch(r"owner=echo@edge1: met after \d\.\ds\n", result.stdout)
     assert len(daemon.asked) == 1
 
 
 def test_time_over_exits_with_5_and_names_what_is_missing(daemon: Daemon) -> None:
-    result = run("--for", "owner=echo@edge2", "--timeout", "0")
+    result = run("--until", "owner=echo@edge2", "--timeout", "0")
     assert (result.exit_code, len(daemon.asked)) == (5, 1)
     assert re.fullmatch(r"owner=echo@edge2: not met after \d\.\ds\n  echo: its owner is edge1\n", result.stdout)
-    body = json.loads(run("--for", "owner=echo@edge2", "--timeout", "0", "--json").stdout)
+    body = json.loads(run("--until", "owner=echo@edge2", "--timeout", "0", "--json").stdout)
     assert (faults(body), body["met"], body["missing"]) == ([], False, ["echo: its owner is edge1"])
 
 
@@ -136,7 +136,7 @@ def test_it_looks_again_until_the_condition_holds(daemon: Daemon) -> None:
     began = time.monotonic()
     mover = threading.Thread(target=move)
     mover.start()
-    assert run("--for", "owner=echo@edge2", "--timeout", "60").exit_code == 0
+    assert run("--until", "owner=echo@edge2", "--timeout", "60").exit_code == 0
     mover.join()
     assert len(daemon.asked) > 1
     within(time.monotonic() - began, 10.0)
@@ -144,20 +144,20 @@ def test_it_looks_again_until_the_condition_holds(daemon: Daemon) -> None:
 
 def test_settled_asks_every_robot_that_is_alive(daemon: Daemon) -> None:
     daemon.status["nodes"][-1]["state"] = "gone"
-    assert run("--for", "settled=echo", "--timeout", "0").exit_code == 0
+    assert run("--until", "settled=echo", "--timeout", "0").exit_code == 0
     assert [request.get("node") for request in daemon.asked] == [None, "robot2"]
 
 
 def test_a_robot_that_does_not_know_a_new_task_yet_is_asked_until_it_does(daemon: Daemon) -> None:
     daemon.behind = 1
-    late = run("--for", "settled=echo", "--timeout", "0")
+    late = run("--until", "settled=echo", "--timeout", "0")
     assert (late.exit_code, late.stdout.splitlines()[1:]) == (5, ["  echo: robot2 has not learnt of it yet"])
     daemon.behind = 1
-    assert (run("--for", "settled=echo", "--timeout", "60").exit_code, daemon.behind) == (0, 0)
+    assert (run("--until", "settled=echo", "--timeout", "60").exit_code, daemon.behind) == (0, 0)
 
 
 def test_nobody_at_the_end_exits_with_3(folder: Path) -> None:
-    result = run("--for", "healthy", "--timeout", "0.6")
+    result = run("--until", "healthy", "--timeout", "0.6")
     assert result.exit_code == 3
     assert f"no daemon in {folder}" in result.stderr
 
@@ -166,6 +166,6 @@ def test_a_daemon_that_comes_up_is_waited_for(folder: Path) -> None:
     late = Daemon(folder)
     opener = threading.Timer(0.7, late.socket.open)
     opener.start()
-    assert run("--for", "healthy", "--timeout", "60").exit_code == 0
+    assert run("--until", "healthy", "--timeout", "60").exit_code == 0
     opener.join()
     late.socket.close()

@@ -152,7 +152,7 @@ class _End:
             if not self.has_left:
                 say("the move stands; `zsched status` on such a node names what it waits for")
         elif not self.found:
-            say(f"{name}: revision {shown(self._revision)} is agreed; `zsched wait --for settled={name}`")
+            say(f"{name}: revision {shown(self._revision)} is agreed; `zsched wait --until settled={name}`")
         else:
             took = told_switch(measured["switched_s"], measured["gap_s"], measured)
             say(f"{name}: settled on {self._node}{took}")

@@ -327,10 +327,10 @@ def _seen(page: Page, body: Json) -> None:
     if sight["is_own"]:
         page.block("HEARS", *_heard(sight))
     elif not sight["is_heard"]:
-        page.row((f"{body['node']} has no utilities of {robot}: its answer did not come in time", page.width, "yellow"))
+        page.row((f"{body['node']} has no worth from {robot}: its answer did not come in time", page.width, "yellow"))
     first = name_room(page.width, 9, *(len(one["node"]) for one in body["candidates"]))
     columns = (first, -7, -7, -7, -8, page.width)
-    page.row(*zip(("CANDIDATE", "cpu", "mem", "net", "utility", ""), columns, ("stage", *["dim"] * 5), strict=True))
+    page.row(*zip(("CANDIDATE", "cpu", "mem", "net", "worth", ""), columns, ("stage", *["dim"] * 5), strict=True))
     for one in body["candidates"]:
         view = next((view for view in one["robots"] if view["robot"] == robot), None)
         if view is None:
@@ -381,7 +381,7 @@ def _tuning(page: Page, body: Json) -> None:
         *deadline,
     )
     if formula := formula_of(body):
-        page.block("UTILITY", (formula, "dim"))
+        page.block("WORTH", (formula, "dim"))
 
 
 def formula_of(body: Json) -> str:
@@ -443,7 +443,7 @@ def _candidates(page: Page, body: Json) -> None:
     first = name_room(page.width, 9, *map(len, robots), *(len(one["node"]) for one in body["candidates"]))
     gauges = [name for name in shares(body["tuning"]["weights"]) if name not in PAPER_METRICS]
     columns = (first, first, -7, -7, -7, *(-max(len(name), 7) for name in gauges), -8, page.width)
-    titles = ("CANDIDATE", "robot", "cpu", "mem", "net", *gauges, "utility", "")
+    titles = ("CANDIDATE", "robot", "cpu", "mem", "net", *gauges, "worth", "")
     page.row(*zip(titles, columns, ("stage", *["dim"] * (len(columns) - 1)), strict=True))
     for one in body["candidates"]:
         for number, view in enumerate(one["robots"]):
@@ -469,7 +469,7 @@ def _sum(page: Page, one: Json, indent: int) -> None:
     if one["total"] is not None:
         text += f" = {one['total']:.4f}"
     if one.get("owed_s") is not None:
-        text += f"; owes {one['owed_s']:.2f} s"
+        text += f"; owed {one['owed_s']:.2f} s"
     if one["why_not"]:
         text, style = f"{text}; {one['why_not']}" if text else one["why_not"], "red"
     tail = f" (needs {need})" if need else " (owner)" if one["is_owner"] else ""

@@ -45,7 +45,7 @@ def subject_of(word: str) -> tuple[str | None, str | None]:
     """
     kind, _, name = word.partition("/")
     if kind not in ("task", "node") or not name:
-        raise CliError(EXIT_USAGE, f"--for {word}: expected task/NAME or node/NAME")
+        raise CliError(EXIT_USAGE, f"--about {word}: expected task/NAME or node/NAME")
     return (name, None) if kind == "task" else (None, name)
 
 
@@ -102,7 +102,7 @@ def history(
     about: Annotated[
         str | None,
         typer.Option(
-            "--for", metavar="node/NAME", help="Only moves to this node or away from it, and orders that name it."
+            "--about", metavar="node/NAME", help="Only moves to this node or away from it, and orders that name it."
         ),
     ] = None,
     since: AgeOption = None,
@@ -119,7 +119,7 @@ def history(
     """
     of_task, of_node = (None, None) if about is None else subject_of(about)
     if task is not None and of_task not in (None, task):
-        raise CliError(EXIT_USAGE, f"{task} and --for {about} are two tasks; name one")
+        raise CliError(EXIT_USAGE, f"{task} and --about {about} are two tasks; name one")
     past = Past(task=task or of_task, about=of_node, since_s=None if since is None else duration_s(since))
     if site:
         return _show_site(asked, past)
@@ -200,7 +200,7 @@ def read_log(door: Door, *, is_moves: bool, cursor: str = "") -> tuple[str, floa
     """
     is_far = door.node is not None or bool(door.endpoint)
     if is_far and not is_moves:
-        instead = f"--for node/{door.node} shows what this machine's log tells of it"
+        instead = f"--about node/{door.node} shows what this machine's log tells of it"
         raise CliError(EXIT_USAGE, f"the log of {door.node} lies on its machine: ask there; {instead}")
     found: list[Json] = []
     while True:
@@ -314,7 +314,7 @@ def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on until Ctrl-C.")] = False,
     since: AgeOption = None,
     about: Annotated[
-        str | None, typer.Option("--for", metavar="task/NAME", help="Or node/NAME: only what is about it.")
+        str | None, typer.Option("--about", metavar="task/NAME", help="Or node/NAME: only what is about it.")
     ] = None,
     types: Annotated[
         str | None, typer.Option("--types", metavar="A,B", help="Only moves, or stages: move, vote, executor, ...")

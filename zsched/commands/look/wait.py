@@ -60,7 +60,7 @@ def parse_condition(text: str) -> Condition:
         return Condition(kind=kind, task=task)
     if kind == "empty" and task and not at:
         return Condition(kind=kind, node=task)
-    raise CliError(EXIT_USAGE, f"--for {text!r} is no condition; there are {FORMS}")
+    raise CliError(EXIT_USAGE, f"--until {text!r} is no condition; there are {FORMS}")
 
 
 def missing(condition: Condition, statuses: Mapping[str, Json]) -> list[str]:
@@ -120,7 +120,7 @@ def wait(
     asked: Answers,
     condition: Annotated[
         str,
-        typer.Option("--for", metavar="CONDITION", help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE."),
+        typer.Option("--until", metavar="CONDITION", help="healthy, quorum, owner=TASK@NODE, settled=TASK, empty=NODE"),
     ],
     timeout: Annotated[
         float, typer.Option("--timeout", min=0.0, max=86400.0, metavar="S", help="Seconds; 0: look once.")
@@ -128,7 +128,7 @@ def wait(
 ) -> int:
     """Wait until a condition holds; say what is missing if it does not in time.
 
-    Example: zsched wait --for healthy --timeout 60
+    Example: zsched wait --until healthy --timeout 60
 
     Exits with 5 when the time is over, with 3 when nobody answers then. A daemon that is not there yet is waited for.
     """

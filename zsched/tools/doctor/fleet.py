@@ -249,8 +249,8 @@ def answer_in_time(scene: Scene) -> Result:
         return passed(told)
     fix = "`timing: wan` or a longer gather_s and ballot_s, or a better link (zsched ping NODE)"
     if most_s > timing.ballot_s:
-        return warned(told, f"utilities count for {timing.gather_s:g} s, ballots for {timing.ballot_s:g} s", fix=fix)
-    return warned(told, f"utilities count for {timing.gather_s:g} s", fix=fix)
+        return warned(told, f"answers count for {timing.gather_s:g} s, ballots for {timing.ballot_s:g} s", fix=fix)
+    return warned(told, f"answers count for {timing.gather_s:g} s", fix=fix)
 
 
 def have_true_clocks(scene: Scene) -> Result:

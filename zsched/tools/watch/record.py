@@ -55,7 +55,7 @@ def record(
         typer.Option("--tf", metavar="KEY", help="The same of a key whose samples are frames (TFMessage, CDR)."),
     ] = None,
 ) -> int:
-    """Record what the fleet does as MCAP, for Foxglove: owners, utilities, moves, streams, events, maps, tf.
+    """Record what the fleet does as MCAP, for Foxglove: owners, worth, moves, streams, events, maps, tf.
 
     Example: zsched record --output run.mcap
 

@@ -158,7 +158,7 @@ def top(
     interval: Annotated[float, typer.Option(min=0.2, max=3600.0, metavar="S", help="Seconds between two.")] = 1.0,
     no_color: NoColorOption = False,
 ) -> int:
-    """Show the fleet on the full screen: nodes, utilities over time, streams, the last moves; q ends.
+    """Show the fleet on the full screen: nodes, their worth over time, streams, the last moves; q ends.
 
     Example: zsched top
     """

@@ -171,10 +171,10 @@ def _bars(task: Json, points: Sequence[Point], frame: Frame) -> list[str]:
         text = short_name(name, room - is_owner) + "*" * is_owner
         label = page.paint(text.ljust(room), "bold" if is_owner else "")
         if name in newest:
-            owes = f"owes {owed[name]:.2f} s" if name in owed else ""  # an older daemon does not tell
-            page.lines.append(f" {label} {newest[name]:.3f}  {owes:11}  {_bar(held, name, page)}")
+            told = f"owed {owed[name]:.2f} s" if name in owed else ""  # an older daemon does not tell
+            page.lines.append(f" {label} {newest[name]:.3f}  {told:11}  {_bar(held, name, page)}")
         else:
-            page.row((" " * (room + 1), room + 1, ""), ("-", 5, ""), (vetoed.get(name, "no utility"), 99, "yellow"))
+            page.row((" " * (room + 1), room + 1, ""), ("-", 5, ""), (vetoed.get(name, "not known"), 99, "yellow"))
             page.lines[-1] = f" {label}{page.lines[-1][room + 1 :]}"
     if len(best) > len(names):
         page.row(("", 1, ""), (f"... {len(best) - len(names)} more candidates", frame.width, "dim"))

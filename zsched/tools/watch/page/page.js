@@ -144,7 +144,7 @@ function chart(task, view) {
     if (path) parts.push(s("path", { class: `curve s${colour(name)}${name === task.owner ? " thick" : ""}`, d: path }));
   }
   parts.push(s("text", { class: "dim small", x: width - 2, y: height + 9, "text-anchor": "end" }, `last ${span(view.to - view.from)}`));
-  return s("svg", { viewBox: `0 0 ${width} ${height + 12}`, role: "img", "aria-label": `utilities of ${task.name} over time` }, parts);
+  return s("svg", { viewBox: `0 0 ${width} ${height + 12}`, role: "img", "aria-label": `worth for ${task.name} over time` }, parts);
 }
 
 function taskCard(task, view) {
@@ -172,7 +172,7 @@ function explained(body) {
     h("td", { class: "number" }, number(one.joint, 4)), h("td", { class: "number" }, number(one.unkept, 4)), h("td", { class: "number" }, number(one.bonus, 3)),
     h("td", { class: "number" }, number(one.total, 4)),
     h("td", { class: "text bad" }, one.why_not || "")));
-  const titles = ["candidate", "joint", "not kept", "bonus", "total", ""];
+  const titles = ["candidate", "mean", "not kept", "bonus", "worth", ""];
   return h("div", { class: "explain" },
     h("p", {}, `${body.outcome} ${body.candidate || ""}: ${body.reason}`),
     h("p", { class: "dim" }, `as ${body.node} judged it ${span(body.age_s)} ago · a move costs ${number(body.price_s, 1)} s · ${body.heard.length} robots heard, ${body.needed} needed`),
