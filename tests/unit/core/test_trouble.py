@@ -41,7 +41,6 @@ TROUBLES = (
     (WorkerState.STOPPED, Trouble.LOST),
     (WorkerState.STOPPED, Trouble.AGAIN),
 )
-NEW_WORDS = ("seen last at noon", "its third start comes soon", "nobody grants it anything")
 TODAYS_WORDS = (
     "was ready until 12:00:00 UTC, its token went: it may hang",
     "restarting (failure 1 of 3): killed by signal 9",
@@ -89,13 +88,6 @@ def decisions(scene: Scene, load: WorkerLoad) -> tuple[object, ...]:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     folder: Path = tmp_path_factory.mktemp("clinic")
     return scene_of(folder, CLINIC)
-
-
-@pytest.mark.parametrize(("state", "trouble"), TROUBLES)
-def test_other_words_decide_nothing(scene: Scene, state: WorkerState, trouble: Trouble) -> None:
-    words = NEW_WORDS if trouble is Trouble.NONE else (*NEW_WORDS, *TODAYS_WORDS)
-    found = {one: decisions(scene, load_of(state=state, trouble=trouble, reason=one)) for one in words}
-    assert len(set(found.values())) == 1, found
 
 
 def test_the_trouble_decides_what_the_state_leaves_open(scene: Scene) -> None:

@@ -16,7 +16,7 @@ from zsched.core.electorate.changes import AdoptDocument, SetDocument, SetLease
 from zsched.core.electorate.documents import RECENT
 from zsched.core.electorate.founding import founded
 from zsched.core.electorate.numbers import in_force
-from zsched.core.electorate.orders import MAX_OPEN, MAX_STORY, document_change
+from zsched.core.electorate.orders import MAX_OPEN, document_change
 from zsched.core.values import events as ev
 from zsched.core.values import instructions as do
 from zsched.core.values.change import RoundOutcome, told_end
@@ -40,7 +40,6 @@ from zsched.core.values.messages import (
 from zsched.core.values.model import Acceptance, Asked, Ballot, RegisterState
 from zsched.core.values.problems import Problem
 from zsched.core.values.todo import ToDo
-from zsched.core.values.words import MAX_ASKED, MAX_ASKER
 from zsched.core.vote.agreement import SETTLE_AFTER_START_S, Agreement
 
 T = TypeVar("T")
@@ -594,13 +593,6 @@ def test_the_journal_tells_who_has_changed_the_fleet() -> None:
     assert (nameless.text, nameless.by) == ("drain robot2, on revision 2: committed", "")
 
 
-def test_a_line_of_the_journal_fits_the_wire_however_long_its_words_are() -> None:
-    longest = Asked(by="a" * MAX_ASKER, reason="b" * MAX_ASKED)
-    text = ended(RoundOutcome.COMMITTED, longest, "c" * 400).text
-    assert len(text) <= MAX_STORY
-    assert text.endswith("…, on revision 2: committed")
-
-
 # --- flags whose time is over ----------------------------------------------------------------------------------------
 
 STAYS = (Flag(kind=FlagKind.INELIGIBLE, subject="robot3", revision=3),)
@@ -627,11 +619,6 @@ def test_a_document_that_is_fetched_is_not_taken_for_the_one_without_those_flags
     assert of(agreed(agreement.on_stored, older, 100.1), do.AskElectors) == []
     wanted = ev.DocumentStored(document="0f", fleet=FLEET)
     assert len(of(agreed(agreement.on_stored, wanted, 100.2), do.AskElectors)) == 1, "that one is still waited for"
-
-
-def test_without_an_agreed_document_there_is_no_flag_to_end() -> None:
-    make().orders.end_flags((), todo := ToDo())
-    assert todo.send == []
 
 
 def test_a_state_s_document_brings_its_flags() -> None:

@@ -151,11 +151,6 @@ def test_what_speaks_against_it_is_said(it: Found, why: str) -> None:
     assert why in plan
 
 
-@pytest.mark.parametrize("role", ["lost_state", "no_elector"])
-def test_an_elector_that_cannot_answer_proposers_is_none(role: str) -> None:
-    planned(found(own=state_of("robot1"), answers=(answer_of("robot2", role=role),)))
-
-
 def test_a_change_of_electors_that_was_only_accepted_is_none_yet() -> None:
     """robot3 is lost for good, and its removal was accepted by both others of four, which are no majority.
 
@@ -304,12 +299,6 @@ def test_the_side_is_named_or_the_only_other_one(values: list[FleetValue], wante
     answers = [answer_of(name, value) for name, value in zip(ROBOTS[1:], values, strict=False)]
     side = choose_side(FLEET, state_of("robot1"), sides_of(answers), wanted)
     assert expected in (side if isinstance(side, str) else side.generation_id)
-
-
-def test_a_node_that_knows_no_generation_is_on_no_side() -> None:
-    waits = answer_of("robot3", replace(LEFT, generation_id=""))
-    (side,) = sides_of([answer_of("robot2", LEFT), waits])
-    assert (side.generation_id, side.nodes) == (LEFT.generation_id, ("robot2",))
 
 
 def test_who_would_hear_nobody_of_the_other_side_does_not_change_to_it() -> None:

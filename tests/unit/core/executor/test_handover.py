@@ -83,16 +83,6 @@ def at(phase: Phase) -> Executor:
 # --- the table, line by line -----------------------------------------------------------------------------------------
 
 
-def test_first_owner_is_prepared_flipped_and_closed_without_a_predecessor() -> None:
-    one = robot()
-    assert plan(done(one.execute, allocation_of(1, "edge1"), 0.0)) == ("prepare", 1, None)
-    phases = [one.phase]
-    assert plan(done(one.on_ready, 1)) == ("flip", 1, None)
-    phases.append(one.phase)
-    assert plan(done(one.on_flipped, 1, 2, 0.5)) == ("close", 1, None)
-    assert [*phases, one.phase] == [Phase.PREPARING, Phase.FLIPPING, Phase.SETTLED]
-
-
 def test_move_goes_through_every_phase_and_keeps_the_old_slot_until_it_is_drained() -> None:
     one = at(Phase.SETTLED)
     assert plan(done(one.execute, allocation_of(2, "edge2"), 1.0)) == ("prepare", 2, 1)
@@ -127,11 +117,6 @@ def test_a_slot_that_drains_goes_on_to_when_the_daemon_restarts() -> None:
     assert plan(done(late.tick, 11.5)) == ("close", 2, None), "its drain time began before the restart"
 
 
-def test_it_is_named_when_the_task_moves_again() -> None:
-    one, _ = began_again(DrainingSlot(epoch=1, owner="edge1"))
-    assert plan(done(one.execute, allocation_of(3, "edge3"), 10.5)) == ("prepare", 3, 1, 2)
-
-
 def test_what_this_daemon_has_dropped_does_not_come_back() -> None:
     one = at(Phase.FLIPPING)
     assert plan(done(one.on_gone, "edge1")) == ("flip", 2, None)
@@ -162,14 +147,6 @@ def test_gone_predecessor_leaves_the_plan_in_every_phase(
     one = at(phase)
     assert plan(done(one.on_gone, "edge1")) == expected
     assert (one.phase, one.predecessors) == (after, ())
-
-
-@pytest.mark.parametrize("phase", [Phase.PREPARING, Phase.FLIPPING, Phase.DRAINING, Phase.SETTLED])
-def test_other_nodes_that_go_change_nothing(phase: Phase) -> None:
-    one = at(phase)
-    assert done(one.on_gone, "edge3") == ()
-    assert done(one.on_gone, "edge2") == (), "giving up on the new owner is a new proposal, never local"
-    assert one.phase is phase
 
 
 @pytest.mark.parametrize(
@@ -278,14 +255,6 @@ def test_every_other_report_is_ignored(name: str, phase: Phase, epoch: int) -> N
     else:
         assert out == ()
         assert one == twin
-
-
-def test_idle_executor_ignores_reports_and_needs_no_time() -> None:
-    one = robot()
-    for act in EVENTS.values():
-        assert act(one, 0) == ()
-    assert done(one.on_gone, "edge1") == ()
-    assert (one.phase, one.next_deadline()) == (Phase.IDLE, math.inf)
 
 
 @pytest.mark.parametrize("late", [allocation_of(1, "edge3"), allocation_of(2, "edge3"), allocation_of(3, None)])
@@ -399,19 +368,6 @@ def test_owner_that_is_chosen_again_while_it_drains_stays_active() -> None:
     assert done(one.tick, 100.0) == ()
 
 
-def test_moves_between_others_do_not_touch_the_role() -> None:
-    one = edge("edge3")
-    told = roles(done(one.execute, allocation_of(1, "edge1"), 0.0))
-    assert told == [(WorkerRole.IDLE, 0)], "once: a standby that hears nothing asks its relay again and again"
-    assert done(one.execute, allocation_of(2, "edge2"), 0.0) == ()
-    drained = edge()
-    done(drained.execute, allocation_of(1, "edge1"), 0.0)
-    done(drained.execute, allocation_of(2, "edge2"), 10.0)
-    deadline = drained.next_deadline()
-    assert done(drained.execute, allocation_of(3, "edge3"), 11.0) == ()
-    assert drained.next_deadline() == deadline
-
-
 def test_cold_standby_is_started_by_its_allocation_and_stopped_after_its_drain() -> None:
     one = edge(spec=COLD)
     assert of(done(one.execute, allocation_of(1, "edge1"), 0.0), StartWorker)
@@ -498,13 +454,6 @@ def test_foreign_worker_is_told_its_role_and_never_started() -> None:
     out = done(one.execute, allocation_of(1, "edge1"), 0.0)
     assert roles(out) == [(WorkerRole.ACTIVE, 1)]
     assert not of(out, StartWorker)
-
-
-def test_robot_that_is_candidate_and_has_streams_gets_both() -> None:
-    spec = replace(SPEC, candidates=("robot1",))
-    one = Executor(spec=spec, me="robot1", has_streams=True)
-    out = done(one.execute, allocation_of(1, "robot1"), 0.0)
-    assert [type(step) for step in out] == [StartWorker, SetRole, ApplyRoutes, RecordStory]
 
 
 def test_an_owner_that_went_stays_gone_whoever_goes_next() -> None:

@@ -25,17 +25,6 @@ def role(out: tuple[Instruction, ...]) -> Role:
     return found
 
 
-def test_a_first_owner_has_no_predecessor() -> None:
-    assert role(execute(edge(), "edge1", 1)).predecessor is None
-
-
-def test_the_owner_before_is_the_predecessor() -> None:
-    one = edge()
-    execute(one, "edge2", 1)
-    found = role(execute(one, "edge1", 2))
-    assert (found.role, found.epoch, found.predecessor) == (WorkerRole.ACTIVE, 2, "edge2")
-
-
 def test_an_owner_that_is_gone_is_not_asked() -> None:
     one = edge()
     execute(one, "edge2", 1)

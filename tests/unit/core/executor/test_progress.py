@@ -86,12 +86,6 @@ def test_outputs_are_reported_and_end_a_complaint() -> None:
     assert robot.run(3) == (), "three seconds of waiting are within the deadline"
 
 
-def test_without_inputs_nobody_can_tell() -> None:
-    robot = Robot()
-    robot.run(10)
-    assert robot.run(DEADLINE_S + 1, inputs=0) == ()
-
-
 def test_an_answer_of_long_ago_says_nothing() -> None:
     robot = Robot()
     assert robot.run(3, outputs=1) == (SERVED,)
@@ -128,21 +122,6 @@ def test_a_task_without_outputs_is_judged_by_acknowledgements_if_there_are_any()
     assert robot.run(7) == (UNSERVED,)
     robot.acknowledged = 60
     assert robot.run(1) == (SERVED,)
-
-
-def test_the_first_acknowledgement_is_an_answer() -> None:
-    robot = Robot(replace(SPEC, rules=(INPUT,)))
-    robot.acknowledged = 0
-    assert robot.run(3) == ()
-    robot.acknowledged = 1
-    assert robot.run(1) == (SERVED,)
-
-
-@pytest.mark.parametrize("worker", [WorkerSpec(command=("merge",)), SPEC.worker])
-def test_only_robots_watch_and_only_tasks_that_say_so(worker: WorkerSpec) -> None:
-    robot = Robot(replace(SPEC, worker=worker))
-    robot.executor.has_streams = worker.output_deadline_s is None
-    assert robot.run(30) == ()
 
 
 # --- the owner -------------------------------------------------------------------------------------------------------
@@ -192,10 +171,6 @@ def test_a_robot_that_is_served_speaks_for_the_worker() -> None:
     assert owner.hear("robot2", LATE, SERVED) == ()
     assert owner.hear("robot1", LATE, UNSERVED) == ()
     assert owner.hear("robot1", LATE + 4, UNSERVED) != (), "robot2's profile is too old to count"
-
-
-def test_complaints_of_another_epoch_do_not_count() -> None:
-    assert Owner().hear("robot1", LATE, replace(UNSERVED, epoch=2)) == ()
 
 
 def test_a_worker_that_has_just_become_ready_or_owner_has_its_time() -> None:

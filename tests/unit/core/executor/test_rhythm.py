@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -70,10 +69,6 @@ def test_an_owner_whose_answers_have_ended_is_overdue_within_five_seconds(*, ack
     assert not robot.run(LEAST_S)
     assert robot.run(1.0)
     assert robot.run(1.0, out_hz=1000.0 if acknowledges else 1.0) is False, "it has answered"
-
-
-def test_a_task_that_has_never_answered_is_not_judged() -> None:
-    assert not Robot().run(600.0)
 
 
 def test_a_task_without_outputs_is_judged_by_acknowledgements_alone() -> None:
@@ -189,12 +184,3 @@ def test_a_handover_and_another_life_of_the_worker_owe_nothing() -> None:
     assert not robot.run(LEAST_S)
     robot.taken = robot.given = 0.0  # another relay
     assert not robot.run(LEAST_S + 1.0)
-
-
-def test_what_is_no_task_any_more_is_forgotten() -> None:
-    robot = Robot()
-    robot.run(20.0, out_hz=10.0)
-    assert robot.run(10.0)
-    robot.progress._in_force.take(fleet_of(task_of("other")))
-    assert robot.overdue_s is None
-    assert math.isfinite(robot.now)

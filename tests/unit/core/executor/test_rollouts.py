@@ -18,7 +18,7 @@ from zsched.core.values import events as ev
 from zsched.core.values import instructions as do
 from zsched.core.values.codec import decode, document_hash, encode
 from zsched.core.values.document import MAX_HELD_BYTES, Document, Rollout, Text
-from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec, WorkerSpec, file_hash, fleet_hash
+from zsched.core.values.fleet import Fleet, OnIsolation, TaskSpec, WorkerSpec, file_hash
 
 OLD, NEW = ("merge", "--old"), ("merge", "--new")
 ENV = (("GAIN", "1"),)
@@ -51,11 +51,6 @@ def test_every_node_that_has_such_a_worker_waits_but_the_first() -> None:
     alone = task(rollout("edge2"), on_isolation=OnIsolation.LOCAL)
     assert waiting(fleet_of(alone), alone) == ("edge1", "robot1", "robot2", "robot3")
     assert waiting(fleet(None), task(None)) == ()
-
-
-def test_a_file_without_a_rollout_has_the_hash_that_it_had() -> None:
-    assert fleet_hash(fleet(rollout("edge2"))) != fleet_hash(fleet(None)), "nodes wait until all know that it is over"
-    assert file_hash(fleet(rollout("edge2"))) == fleet_hash(fleet(None)) == file_hash(fleet(None))
 
 
 def test_a_document_carries_it_and_one_without_has_the_frame_of_before() -> None:

@@ -181,14 +181,6 @@ def test_questions_are_asked_five_times_a_second_and_only_while_something_is_ope
     assert one.to_ask(values(), 2.0) == ()
 
 
-def test_every_task_s_candidates_are_asked_once() -> None:
-    second = replace(EXCLUSIVE, name="other", candidates=("e1", "e2", "e3"))
-    known = values(value(), value("other"))
-    assert sealing(fleet(EXCLUSIVE, second)).to_ask(known, 1.0) == ("e2", "e3")
-    known = values(value(leased=True), value("other", owner="e2"))
-    assert sealing(fleet(EXCLUSIVE, second)).to_ask(known, 1.0) == (), "leased; not ours"
-
-
 @pytest.mark.parametrize(
     ("of", "known"),
     [

@@ -93,13 +93,6 @@ def test_a_state_that_is_lost_is_shown_for_a_minute_also_of_a_worker_that_starts
     assert Workers({}).on_troubled(cold, 0.0) is None
 
 
-def test_an_unknown_task_is_nobody_s_worker() -> None:
-    workers = Workers({})
-    assert workers.on_changed(changed(WorkerState.READY)) is None
-    workers.on_troubled(ev.WorkerTroubled(task="merge", count=1, text="x"), 0.0)
-    assert (workers.states, said(workers, 0.0)) == ({}, {})
-
-
 def test_a_worker_that_should_be_started_again_is_told_of_while_it_is_ready() -> None:
     workers = Workers(states={"merge": WorkerState.READY})
     workers.on_outdated(ev.WorkerOutdated(task="merge", reason="x" * 500))

@@ -69,11 +69,6 @@ def test_demand_is_the_larger_of_the_fleet_file_and_the_measurement(
     assert learnt(profile(*used)) == Amount(cpu_cores=demand[0], memory_mb=demand[1])
 
 
-def test_the_newest_measurement_replaces_the_older_ones() -> None:
-    first = profile(2.0, 900.0)
-    assert learnt(first, profile(0.5, 300.0), every_s=HOLDS_ALL_S) == Amount(cpu_cores=0.5, memory_mb=300.0)
-
-
 def test_the_memory_of_a_task_that_has_just_come_is_the_least_that_it_needs() -> None:
     """A worker takes its memory by and by; more than was known counts at once."""
     settled, rising = profile(2.0, 900.0), profile(2.0, 100.0, node="edge2")
@@ -114,10 +109,6 @@ def test_a_machine_of_twice_the_speed_needs_half_the_cores(here: float, there: f
         assert need == pytest.approx(max(cores * here / there, TASK.demand.cpu_cores))
 
 
-def test_a_machine_that_nobody_has_timed_counts_as_one_of_speed_1() -> None:
-    assert learnt(profile(1.0, speed=2.0), there=profile(node="edge2")).cpu_cores == 2.0
-
-
 @pytest.mark.parametrize("state", [WorkerState.STOPPED, WorkerState.STARTING, WorkerState.FAILED])
 def test_a_task_does_not_cost_less_because_its_worker_restarts(state: WorkerState) -> None:
     known, restarting = profile(1.5, 600.0), profile(0.0, 20.0, state=state)
@@ -141,16 +132,6 @@ def test_a_figure_that_was_not_measured_leaves_the_known_one() -> None:
     known = profile(1.5, 600.0)
     for without in (profile(None, None), profile(cpu=None), replace(known, workers=())):
         assert learnt(known, known, without) == Amount(cpu_cores=1.5, memory_mb=600.0)
-
-
-def test_only_another_figure_is_news() -> None:
-    demands = Demands()
-    assert demands.learn("merge", profile(1.5), 0.0)
-    assert not demands.learn("merge", profile(1.5), 1.0)
-    assert not demands.learn("merge", profile(1.5, node="edge2"), 2.0)
-    assert demands.learn("merge", profile(1.6, node="edge2"), 3.0)
-    assert not demands.learn("merge", profile(9.0, node="edge2", state=WorkerState.STARTING), 4.0)
-    assert not demands.learn("merge", profile(9.0, node="edge2", cpu=None), 5.0)
 
 
 # --- by the worker's own word --------------------------------------------------------------------------------------
@@ -378,14 +359,6 @@ def test_how_long_jobs_are_seen_to_take_counts_on_a_full_machine_where_the_task_
     assert demands.seen_s("merge", calm) == 0.0
     assert demands.seen_s("merge", replace(full, node="edge2")) == 0.0
     assert demands.seen_s("merge", profile(0.2, cpu=4.0)) == 0.0
-
-
-def test_the_same_word_again_is_no_news() -> None:
-    """Nothing is scored anew for it: a worker speaks five times a second."""
-    demands = Demands()
-    news = [demands.learn("merge", word, 10.0 * at) for at, word in enumerate([told(9.0)] * 3)]
-    assert news == [True, False, False]
-    assert demands.learn("merge", told(9.0, cpu_s=0.3), 30.0)
 
 
 @pytest.mark.parametrize("is_moved", [True, False])

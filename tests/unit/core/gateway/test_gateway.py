@@ -51,14 +51,6 @@ def test_what_is_fresh_now_is_fresh_until_then_also_at_the_very_end() -> None:
     assert gateway.fresh_until(TTL_S + 0.001) == math.inf
 
 
-def test_each_new_figure_is_one_more_version() -> None:
-    gateway = gateway_with(profile(0))
-    before = gateway.version
-    gateway.learn_demand("merge", "edge1", 0.0)
-    gateway.learn_demand("merge", "edge1", 0.0)
-    assert gateway.version == before + 1, "the second look found nothing new"
-
-
 def test_a_battery_is_remembered_for_its_node_s_life_and_for_as_long_as_the_node_is_in_the_fleet() -> None:
     full = replace(profile(0), gauges=(("battery", 0.6), ("gpu", 0.3), ("wind", 5.0)))
     gateway = gateway_with(full)
@@ -127,21 +119,6 @@ def test_a_stale_repeat_does_not_make_the_profile_younger() -> None:
     gateway.absorb(profile(5), TTL_S)
 
     assert gateway.fresh("edge1", TTL_S + 0.1) is None
-
-
-def test_a_node_that_is_not_in_the_fleet_file_is_foreign() -> None:
-    gateway = Gateway(InForce(FLEET))
-
-    assert gateway.absorb(profile(node="edge9"), 0.0) == "foreign"
-    assert gateway.newest("edge9", 0.0) is None
-
-
-def test_fresh_up_to_its_time_to_live_and_not_longer() -> None:
-    gateway = gateway_with(profile())
-
-    assert gateway.fresh("edge1", TTL_S) == profile()
-    assert gateway.fresh("edge1", TTL_S + 0.001) is None
-    assert gateway.newest("edge1", TTL_S + 0.001) is not None
 
 
 # --- demand (more of it: test_demand.py) ---------------------------------------------------------------------------

@@ -64,12 +64,6 @@ def test_where_it_got_less_than_its_share_that_is_believed_of_this_machine_only(
     assert shares.at("merge", idle(), 4.0) == pytest.approx(fair), "the newest counts, and no more than is fair"
 
 
-def test_the_same_again_is_no_news() -> None:
-    shares = Shares()
-    assert shares.learn("merge", profile(got=0.5, wanted=4.0), 0.0)
-    assert not shares.learn("merge", profile(got=0.5, wanted=4.0), 0.0)
-
-
 def test_what_it_got_counts_as_a_part_of_what_as_many_threads_would_get_by_fairness() -> None:
     shares = Shares()
     shares.learn("merge", profile(got=0.25, wanted=0.95), 0.0)
@@ -77,24 +71,6 @@ def test_what_it_got_counts_as_a_part_of_what_as_many_threads_would_get_by_fairn
     assert shares.at("merge", idle(), 0.25) == pytest.approx(4.0 / 9 / 2), "beside seven others half a core is fair"
     shares.learn("merge", profile(runnable=2.0, got=2.0, wanted=4.0), 0.0)
     assert shares.at("merge", idle(runnable=0.0), 0.25) == pytest.approx(2.0), "the machine is the task's alone"
-
-
-def test_a_task_and_a_node_that_are_no_more_are_forgotten() -> None:
-    fair = fair_share(4.0, 4.0, 8.0)
-    for is_node in (True, False):
-        shares = Shares()
-        shares.learn("merge", profile(got=0.5, wanted=4.0), 0.0)
-        shares.keep({"edge1"})
-        assert shares.at("merge", idle(), 4.0) < fair
-        if is_node:
-            shares.keep({"edge2"})
-        else:
-            shares.forget("merge")
-        assert shares.at("merge", idle(), 4.0) == pytest.approx(fair)
-
-
-def test_nothing_is_learnt_of_a_worker_whose_use_nobody_measured() -> None:
-    assert not Shares().learn("merge", profile(got=None, wanted=3.0), 0.0)
 
 
 @pytest.mark.parametrize("need_cores", [0.3, 2.0])
@@ -211,18 +187,3 @@ def test_it_may_go_on_for_some_seconds_after_it_has_another_owner() -> None:
     for at in range(300, 320):
         shares.learn("merge", unmeasured(6.0), float(at))
     assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (4.0, 2.0), "it has come again"
-
-
-@pytest.mark.parametrize("is_of_task", [True, False])
-def test_nothing_is_known_of_a_task_or_a_node_that_is_no_more(*, is_of_task: bool) -> None:
-    for has_come in (False, True):
-        shares = Shares()
-        shares.look_elsewhere("merge", unmeasured(1.0), -1.0)
-        if has_come:
-            come(shares, others=None, runnable=6.0)
-        if is_of_task:
-            shares.forget("merge")
-        else:
-            shares.keep({"edge2"})
-        come(shares, others=None, runnable=6.0)
-        assert shares.beside_unmeasured("merge", unmeasured(6.0), 2.0) == (2.0, 4.0)

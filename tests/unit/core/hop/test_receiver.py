@@ -6,7 +6,7 @@ from random import Random
 
 import pytest
 
-from zsched.core.hop.receiver import GIVE_UP_S, MAX_AHEAD, RETURN, STEP_S, RunningTime, Source
+from zsched.core.hop.receiver import GIVE_UP_S, MAX_AHEAD, RETURN, RunningTime, Source
 from zsched.core.hop.serial import SPAN, serial_of
 
 
@@ -38,13 +38,6 @@ def test_the_time_of_a_gap_begins_with_its_first_number_and_ends_when_it_is_fill
     heard(source, 0, 1, now=1.6)
     assert source.gap_since is None
     assert source.waits_s(2.0) == 0.0
-
-
-@pytest.mark.parametrize("start", [0, SPAN - 3, 3 * SPAN - 1])
-def test_numbers_go_on_beyond_what_travels(start: int) -> None:
-    source = Source.at(start)
-    assert heard(source, *range(start, start + 8)) == [True] * 8
-    assert source.arrived == start + 8
 
 
 def test_what_is_absurdly_far_ahead_is_dropped_and_changes_nothing() -> None:
@@ -150,13 +143,6 @@ def test_what_a_stopped_process_slept_is_not_waited_for() -> None:
     for step in range(18):  # it runs, and looks
         assert heard(source, 3, now=time.at(14.0 + step / 25)) == [False]
     assert heard(source, 3, now=time.at(14.8)) == [True]
-
-
-def test_time_runs_on_while_somebody_looks() -> None:
-    time = RunningTime()
-    assert [time.at(now) for now in (5.0, 5.2, 5.4)] == pytest.approx([5.0, 5.2, 5.4])
-    assert time.at(9.4) == pytest.approx(5.4 + STEP_S)
-    assert time.at(9.5) == pytest.approx(5.5 + STEP_S)
 
 
 def test_a_jump_is_taken_back_to_numbers_within_it_only() -> None:

@@ -34,10 +34,6 @@ def test_three_slow_beats_fit_into_the_silence_that_makes_a_peer_suspect(timing:
     assert timing.beat_s < timing.rest_beat_s <= min(2 * timing.beat_s, timing.suspect_s / 3)
 
 
-def test_a_fleet_with_no_room_between_its_times_has_one_pace() -> None:
-    assert replace(WIFI, beat_s=0.4).rest_beat_s == 0.4
-
-
 def test_a_node_is_calm_once_its_beats_have_said_the_same_for_long_enough() -> None:
     pace = Pace(in_force=HERE)
     assert not sent(pace, 1, 100.0).calm
@@ -66,9 +62,3 @@ def test_what_happens_brings_the_next_beat_to_where_full_pace_would_have_it(at: 
     pace = calm()
     assert pace.hasten(100.4, at) == pytest.approx(due)
     assert not sent(pace, 3, due).calm
-
-
-def test_at_full_pace_nothing_is_brought_forward() -> None:
-    pace = Pace(in_force=HERE)
-    pace.next_at(sent(pace, 1, 100.0), are_all_calm=True)
-    assert pace.hasten(100.2, 100.1) == 100.2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import partial
 from random import Random
@@ -88,16 +87,6 @@ def test_a_token_that_goes_does_not_tell_that_another_one_s_time_is_up() -> None
 
 
 # --- hearing ---------------------------------------------------------------------------------------------------------
-
-
-def test_configured_peer_is_unknown_until_it_beats() -> None:
-    ear = Ear(SMALL)
-    assert ear.members.states() == {"a": UNKNOWN, "b": UNKNOWN, "me": ALIVE}
-    assert ear.members.next_deadline() == math.inf
-    assert ear.members.incarnation("a") is None
-    assert ear.beat("a", 1.0) == [ALIVE]
-    assert ear.members.alive() == ("a",)
-    assert ear.members.incarnation("a") == 1
 
 
 def test_stranger_is_nobody() -> None:
@@ -450,13 +439,6 @@ def test_token_of_a_former_life_accuses_nobody() -> None:
     assert ear.members.state("a") is ALIVE
 
 
-def test_token_of_a_suspect_or_gone_peer_changes_nothing_more() -> None:
-    ear = heard(SMALL)
-    ear.members.tick(9.0)
-    assert ear.members.absorb_token_lost("a", 1, 9.1) == ()
-    assert ear.members.state("a") is GONE
-
-
 # --- self-doubt ------------------------------------------------------------------------------------------------------
 
 
@@ -577,14 +559,6 @@ def test_a_fleet_is_calm_when_every_living_peer_says_so() -> None:
     assert not ear.members.is_uneasy(0.8)
 
 
-def test_who_is_gone_keeps_nobody_from_being_calm() -> None:
-    ear = calm_ear()
-    ear.members.absorb_beat(beat_of("b", 3), 0.4)
-    ear.members.absorb_token_lost("b", 1, 1.0)
-    assert ear.members.are_calm, "its last word counts no more"
-    assert ear.members.is_uneasy(1.0), "somebody is suspect"
-
-
 def test_a_missing_beat_is_uneasy_until_the_next_one_comes_in_order() -> None:
     ear = calm_ear()
     ear.members.absorb_beat(beat_of("c", 4, calm=True), 0.4)
@@ -644,14 +618,6 @@ def test_beats_that_are_held_up_twice_lengthen_the_silence_that_counts() -> None
     at = hold_up(ear, "a", 10.0, silent_s=0.7)
     at = hold_up(ear, "b", at + 5.0, silent_s=0.7)
     assert silence_before_suspicion(ear, "c", at) == pytest.approx(LOSS_FACTOR * WIFI.suspect_s)
-
-
-def test_one_beat_that_is_held_up_changes_nothing() -> None:
-    ear = heard(LARGE)
-    at = hold_up(ear, "a", 10.0, silent_s=0.7)
-    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s)
-    at = hold_up(ear, "a", at + LOSSY_S + 5.0, silent_s=0.7)
-    assert silence_before_suspicion(ear, "c", at) == pytest.approx(WIFI.suspect_s)
 
 
 def test_one_moment_that_holds_several_up_changes_nothing() -> None:

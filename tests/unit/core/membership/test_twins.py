@@ -62,12 +62,6 @@ def test_a_node_that_stood_still_while_a_twin_came_and_left_disputes_nothing() -
     assert identity.on_own_name(beat(8, 10 + STAYS), 5000, 100.0 + 2 * STAYS_S) is Verdict.DISPUTE
 
 
-def test_our_own_beats_say_nothing() -> None:
-    identity = old()
-    assert identity.on_own_name(beat(7, 3), 5000, 100.0) is Verdict.OURS
-    assert "another daemon calls itself 'robot1'; stop it" in (identity.complaint(100.0) or "")
-
-
 def test_beats_in_our_name_are_shown_until_they_have_stopped_for_long_enough() -> None:
     identity = Identity(me="robot1", incarnation=7, in_force=HERE, started_at=0.0)
     assert identity.complaint(100.0) is None

@@ -39,7 +39,6 @@ from zsched.core.values.messages import (
     Promise,
     ReadFleet,
     ReadHistory,
-    ReadLines,
     Refusal,
     Refused,
     RestartTask,
@@ -443,24 +442,6 @@ def test_an_owner_that_this_machine_missed_for_a_while_is_asked_for_its_worker_s
 # --- own events like peers' ------------------------------------------------------------------------------------------
 
 
-def test_own_profile_enters_the_gateway_as_it_leaves() -> None:
-    node = make()
-    batch = node.handle(ev.ProfileSampled(device=SAMPLE), 100.0)
-    (published,) = of(batch, do.PublishProfile)
-    data = node.gateway.newest("robot1", 100.0)
-    assert data is not None
-    assert data.profile == published.profile
-    assert node.handle(ev.ProfileReceived(profile=replace(published.profile, cpu_used_cores=4.0)), 100.0) == ()
-    assert node.gateway.newest("robot1", 100.0) == data, "nobody speaks for us"
-
-
-def test_draining_is_told_in_the_same_batch() -> None:
-    node = started("edge1", learnt=allocation_of(1, "edge1"))
-    (published,) = of(node.handle(ev.StopRequested(), 100.1), do.PublishProfile)
-    assert published.profile.draining
-    assert published.is_news
-
-
 def test_a_robot_that_drains_what_it_owns_asks_at_once_who_shall_have_it() -> None:
     (task,) = FLEET.tasks
     fleet = replace(FLEET, tasks=(replace(task, candidates=(*EDGES, "robot1")),))
@@ -531,13 +512,6 @@ def test_stopped_worker_is_told_in_the_same_batch_and_once() -> None:
     assert published.is_news
     assert [one.text for one in of(batch, do.RecordStory)] == ["worker failed: exit code 1"]
     assert node.handle(ev.WorkerChanged(task="merge", state=WorkerState.FAILED), 100.1) == ()
-
-
-@pytest.mark.parametrize("task", ["merge", "other"])
-def test_worker_of_a_task_that_does_not_run_here_is_ignored(task: str) -> None:
-    node = started("robot1")
-    assert not of(node.handle(ev.WorkerChanged(task=task, state=WorkerState.READY), 100.0), do.RecordStory)
-    assert node.worker_states == {}
 
 
 # --- what people are told --------------------------------------------------------------------------------------------
@@ -824,27 +798,7 @@ def test_a_node_that_our_file_does_not_name_is_told_while_it_beats() -> None:
     assert any("robot99" in one for one in told(again + SHOWN_AFTER_S)), "the others made room"
 
 
-def test_our_own_token_is_no_problem() -> None:
-    node = started()
-    node.handle(ev.TokenSeen(node="robot1", incarnation=7), 100.0)
-    node.handle(ev.BeatReceived(beat=beat("robot1", incarnation=7)), 100.0)
-    assert node.problems == {}
-
-
-def test_adapters_problem_comes_and_goes_by_its_source() -> None:
-    node = started()
-    node.handle(ev.ProblemReported(source="PublishBeat", problem="closed"), 100.0)
-    node.handle(ev.ProblemReported(source="profile", problem="no /proc"), 100.0)
-    node.handle(ev.ProblemReported(source="PublishBeat", problem=None), 100.0)
-    assert node.problems == {("profile", ""): "no /proc"}
-
-
 # --- peers -----------------------------------------------------------------------------------------------------------
-
-
-def test_beat_that_knows_more_is_asked() -> None:
-    batch = started().handle(ev.BeatReceived(beat=beat("edge2", 2, revision=1)), 100.0)
-    assert [one.peer for one in of(batch, do.AskLearnt)] == ["edge2"]
 
 
 def test_changes_of_peers_are_told_at_once() -> None:
@@ -876,15 +830,6 @@ def test_beats_are_numbered_one_by_one() -> None:
         now = max(node.next_deadline(), now)
         numbers += [one.beat.sequence for one in of(node.handle(ev.DeadlineReached(), now), do.PublishBeat)]
     assert numbers == list(range(numbers[0], numbers[0] + 4))
-
-
-def test_beats_in_turn_are_no_news() -> None:
-    node = started()
-    told = [
-        one for _ in range(3) for one in of(node.handle(ev.DeadlineReached(), node.next_deadline()), do.PublishBeat)
-    ]
-    assert told
-    assert not any(one.is_news for one in told[1:])
 
 
 @pytest.mark.parametrize(
@@ -937,12 +882,6 @@ def test_after_a_stall_nobody_is_accused_whose_beat_waits() -> None:
     hasty = started()
     batch = hasty.handle(ev.BeatReceived(beat=beat("robot2", 30)), now)
     assert len([one for one in of(batch, do.RecordStory) if "-> suspect" in one.text]) == 3, "what it is good for"
-
-
-def test_profiles_with_other_figures_are_no_news() -> None:
-    node = started()
-    (told,) = of(node.handle(ev.ProfileSampled(device=replace(SAMPLE, cpu_used_cores=3.5)), 102.0), do.PublishProfile)
-    assert not told.is_news
 
 
 # --- a node that a task has left -------------------------------------------------------------------------------------
@@ -1111,11 +1050,6 @@ def test_a_certificate_is_handed_on_whoever_has_sent_it() -> None:
     ]
     with pytest.raises(ValueError, match="at most 4096"):
         TakeCertificate(certificate=Text("x" * 4097))
-
-
-def test_a_question_for_lines_is_handed_on() -> None:
-    batch = make("edge1").handle(ev.LinesAsked(request=7, command=ReadLines(task="merge", after=3)), 100.0)
-    assert of(batch, do.AnswerLines) == [do.AnswerLines(request=7, task="merge", after=3)]
 
 
 def test_a_question_for_the_history_is_handed_on_and_names_a_place_in_a_log() -> None:

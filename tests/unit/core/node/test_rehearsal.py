@@ -109,16 +109,6 @@ def test_the_end_of_the_daemon_and_of_the_links_is_the_machines_matter(step: Ste
     assert isinstance(story, do.RecordStory)
 
 
-def test_a_plan_does_nothing() -> None:
-    owner = Owner()
-    (answer,) = owner.strike(Step.WORKER, is_plan=True)
-    assert isinstance(answer, do.AnswerCommand)
-    assert answer.result.outcome is CommandOutcome.OK
-    (strike,) = owner.strike(Step.DAEMON, is_plan=True)
-    assert isinstance(strike, do.StrikeDaemon)
-    assert strike.strike.is_plan
-
-
 @pytest.mark.parametrize("step", [Step.DAEMON, Step.LINK])
 def test_a_wish_that_came_over_the_network_ends_a_node_of_a_secured_fleet_only(step: Step) -> None:
     said = Owner().refusal(step, is_near=False)

@@ -13,13 +13,12 @@ from support.allocations import allocation_of
 from support.beats import beat_of
 from support.fleets import fleet_of, task_of, tuning_of
 from support.profiles import load_of, profile_of
-from support.proposals import proposal_of
 from support.states import state_of
 from zsched.commands.base.report import degradations, render_status
 from zsched.core.membership.solitude import TAKEN
 from zsched.core.node import status
 from zsched.core.node.node import Node
-from zsched.core.node.status import build_explanation, build_snapshot, status_line
+from zsched.core.node.status import build_snapshot, status_line
 from zsched.core.values import events as ev
 from zsched.core.values import instructions as do
 from zsched.core.values.document import Flag, FlagKind
@@ -31,14 +30,13 @@ from zsched.core.values.fleet import (
     Standby,
     WorkerSpec,
     electorate_hash,
-    lease_terms,
 )
 from zsched.core.values.instructions import RecordStory
 from zsched.core.values.messages import Learnt
-from zsched.core.values.model import PeerState, ScoreForm
+from zsched.core.values.model import PeerState
 from zsched.core.values.plan import ReadyWhen, StreamCount
 from zsched.core.values.problems import Problem
-from zsched.core.values.profile import DeviceSample, Echo, Jobs, LinkSample, LinkSource, WorkerState
+from zsched.core.values.profile import DeviceSample, Jobs, LinkSample, LinkSource, WorkerState
 from zsched.core.values.report import snapshot_json
 from zsched.core.values.snapshot import SCHEMA, Snapshot
 from zsched.core.values.startup import NoState, Startup
@@ -344,13 +342,6 @@ def test_one_elector_on_which_init_was_forgotten_is_told_with_the_command() -> N
     assert build_snapshot(node, 100.4).problems == ()
 
 
-def test_one_node_without_a_state_is_not_the_fleet() -> None:
-    node = forgotten(stateless=("robot1",))
-    problems = build_snapshot(node, 100.0).problems
-    assert "state: /x/state does not exist" in problems
-    assert not any(one.startswith("never initialised") for one in problems)
-
-
 @pytest.mark.parametrize(
     "strange",
     [{"generation": 2}, {"electorate": "0" * 16}, {"generation": 2, "electorate": f"{electorate_hash(FLEET)}/2"}],
@@ -402,22 +393,6 @@ def test_an_elector_that_is_none_by_its_own_file_counts_for_nothing() -> None:
     assert any("no quorum: 1 of 3" in one for one in degradations(snapshot_json(build_snapshot(alone, 100.0))))
 
 
-@pytest.mark.parametrize(
-    "compatible",
-    [
-        {"fleet_file": "0" * 16},
-        {"fleet_file": "0" * 16, "lease_terms": f"{lease_terms(FLEET)}, clock in doubt"},
-        {"electorate": electorate_hash(FLEET), "lease_terms": "0" * 16},
-    ],
-    ids=["another file, from a peer that tells no terms", "a clock in doubt", "leases of another length"],
-)
-def test_an_elector_with_another_file_and_the_same_electors_counts(compatible: dict[str, Any]) -> None:
-    node = make()
-    beat = replace(beat_of("robot2", 2, incarnation=3), **compatible)
-    node.handle(ev.BeatReceived(beat=beat), 100.0)
-    assert (build_snapshot(node, 100.0).quorum.alive, build_snapshot(node, 100.0).quorum.apart) == (3, ())
-
-
 def test_a_node_of_another_generation_is_told_with_the_command_that_mends_it() -> None:
     node = make()
     node.handle(ev.BeatReceived(beat=beat_of("robot2", 2, incarnation=3, generation=2)), 100.0)
@@ -426,20 +401,6 @@ def test_a_node_of_another_generation_is_told_with_the_command_that_mends_it() -
     assert not any("init" in one for one in said), "it may be about to be stopped"
     ahead = "stop this daemon, `zsched fleet recover --generation 2` here, start it"
     assert any(one.startswith(ahead) for one in build_snapshot(node, LATE).problems)
-
-
-@pytest.mark.parametrize(("me", "has_state"), [("robot1", True), ("robot1", False), ("edge1", False)])
-def test_an_elector_s_beat_says_what_it_counts_with(me: str, *, has_state: bool) -> None:
-    node = make(me, has_state=has_state)
-    sent = [one.beat for one in node.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat)]
-    assert [beat.electorate for beat in sent] == [electorate_hash(FLEET) if has_state else ""]
-
-
-@pytest.mark.parametrize(("me", "has_state"), [("robot1", True), ("robot1", False), ("edge1", False)])
-def test_a_beat_says_whether_an_elector_has_lost_its_state(me: str, *, has_state: bool) -> None:
-    node = make(me, has_state=has_state)
-    sent = [one.beat for one in node.handle(ev.DeadlineReached(), 101.0) if isinstance(one, do.PublishBeat)]
-    assert [beat.has_lost_state for beat in sent] == [me in ROBOTS and not has_state]
 
 
 @pytest.mark.parametrize("me", ["robot1", "edge1"])
@@ -454,21 +415,6 @@ def test_a_tuned_price_is_told_by_nodes_that_judge_nothing_too(me: str) -> None:
     assert {one.name: one.tuning.price_s for one in build_snapshot(node, 100.1).tasks}[value.task] == 0.9
 
 
-@pytest.mark.parametrize("deadline_ms", [None, 100.0])
-def test_the_way_there_and_back_is_told_of_a_task_with_a_deadline(deadline_ms: float | None) -> None:
-    node = make()
-    tuning = replace(TUNING, deadline_ms=deadline_ms, score=ScoreForm.SERVICE)
-    value = allocation_of(tuning=tuning)
-    node.handle(ev.LearntReceived(learnt=Learnt(node="robot2", values=(value,)), is_answer=True), 100.0)
-    ours = profile_of("robot1", incarnation=7, memory_mb=100.0, memory_used_mb=1.0)
-    node.round_trips.note_sent(ours, 100.0)
-    echo = Echo(node="robot1", incarnation=7, sequence=1, held_s=0.5)
-    for name in ("edge1", "robot2"):
-        node.round_trips.note_heard(replace(ours, node=name, echoes=(echo,)), 7, 101.0)
-    told = {task.name: task.round_trips for task in build_snapshot(node, 101.0).tasks}
-    assert told == {"merge": () if deadline_ms is None else (("edge1", 0.5),), "merge2": ()}
-
-
 def test_a_task_tells_whether_its_worker_could_tell_of_jobs() -> None:
     node = make()
     assert {task.tells_no_jobs for task in build_snapshot(node, 100.0).tasks} == {False}
@@ -476,17 +422,6 @@ def test_a_task_tells_whether_its_worker_could_tell_of_jobs() -> None:
     node.handle(ev.FleetChanged(fleet=replace(FLEET, tasks=(foreign, *FLEET.tasks[1:]))), 100.1)
     (first, *others) = snapshot_json(build_snapshot(node, 100.2))["tasks"]
     assert (first["tells_no_jobs"], {task["tells_no_jobs"] for task in others}) == (True, {False})
-
-
-def test_an_explanation_says_whether_jobs_are_known_that_a_deadline_needs() -> None:
-    node = make()
-    never = build_explanation(node, "merge", 100.0)
-    assert (never.knows_jobs, never.age_s) == (False, 0.0), "it was never judged"
-    load = load_of("merge", cpu_cores=0.5, jobs=Jobs(time_s=0.1, cpu_s=0.05, done_hz=5.0, wanted_hz=5.0))
-    owner = profile_of("edge1", memory_mb=100.0, memory_used_mb=1.0, cpu_used_cores=0.5, workers=(load,))
-    for second in range(60):
-        node.gateway.demands.learn("merge", owner, 100.0 + second)
-    assert build_explanation(node, "merge", 160.0).knows_jobs is True
 
 
 def test_problems_say_what_is_missing_in_words() -> None:
@@ -499,14 +434,6 @@ def test_problems_say_what_is_missing_in_words() -> None:
         "no valid state file: this node is no elector (see `zsched init --help`)",
     )
     assert build_snapshot(make(), 100.0).problems == ()
-
-
-def test_a_state_of_another_electorate_is_not_told_as_lost() -> None:
-    node = make(has_state=False)
-    node.startup = Startup(no_state=NoState.ANOTHER_ELECTORATE)
-    snapshot = build_snapshot(node, 100.0)
-    assert snapshot.quorum.this_node == "other_electorate"
-    assert not any("no valid state file" in one for one in snapshot.problems), snapshot.problems
 
 
 def test_a_quorum_without_a_margin_is_a_problem_that_names_who_is_missing() -> None:
@@ -612,14 +539,6 @@ def test_robots_that_cannot_make_a_majority_are_a_problem_while_electors_can() -
     assert build_snapshot(node, 100.0).problems == ()
 
 
-def test_where_no_robot_can_vote_nobody_is_said_to_be_replaced() -> None:
-    edges = fleet_of(*FLEET.tasks, of=(*EDGES, *ROBOTS), electors=EDGES[:1])
-    node = make("edge1", alive=(), fleet=edges)
-    (problem,) = (one for one in build_snapshot(node, 100.0).problems if "can vote" in one)
-    assert problem.startswith("no planned moves: 0 of 3 robots can vote, 2 needed")
-    assert problem.endswith("No owner is replaced")
-
-
 def test_a_fleet_without_robots_says_that_nobody_votes() -> None:
     edges = fleet_of(*FLEET.tasks, of=EDGES, electors=EDGES[:1])
     hashed = electorate_hash(edges)
@@ -662,16 +581,6 @@ def test_a_task_without_an_owner_says_which_workers_somebody_else_has_to_start()
     assert build_snapshot(node, 100.0).tasks[0].problems == (), "our own standby, which a move starts"
     node.in_force.take(replace(FLEET, tasks=tuple(replace(task, worker=WorkerSpec()) for task in FLEET.tasks)))
     assert build_snapshot(node, 100.0).tasks[0].problems == ("the worker on edge1 is stopped: no token",)
-
-
-def test_a_task_without_an_owner_says_which_workers_have_failed_before() -> None:
-    node = make()
-    node.handle(ev.BeatReceived(beat=beat_of("edge1", incarnation=3)), 100.0)
-    told_by(node, "edge1", 1, WorkerState.STARTING, "pid 7")
-    assert build_snapshot(node, 100.0).tasks[0].problems == (), "it starts"
-    told_by(node, "edge1", 2, WorkerState.STARTING, "restarting (failure 1 of 3): not ready within 20 s", Trouble.AGAIN)
-    said = ("the worker on edge1 is restarting (failure 1 of 3): not ready within 20 s",)
-    assert build_snapshot(node, 100.0).tasks[0].problems == said
 
 
 def served(edges: tuple[str, ...] = EDGES, worker: WorkerSpec = FLEET.tasks[0].worker) -> Node:
@@ -1011,15 +920,6 @@ def test_a_ready_worker_that_our_relay_does_not_see_is_told_although_it_owns_not
     ), "the owner's is told once, by the wait"
 
 
-def test_an_owner_that_our_relay_does_not_see_is_told_by_the_wait_for_it_alone() -> None:
-    node = make()
-    learn(node, 1, "edge1")
-    node.unseen.found["merge"] = frozenset(EDGES)
-    (told, waits) = build_snapshot(node, 103.0).tasks[0].problems
-    assert told.startswith("the worker on edge2 is ready, and our relay does not see its token")
-    assert waits.startswith("this robot's streams have waited for edge1 for 3 s")
-
-
 def test_a_worker_that_shows_itself_before_we_have_its_document_is_seen_once_we_have() -> None:
     """edge1 has adopted the document with a new task before this robot."""
     node = make()
@@ -1057,33 +957,6 @@ def test_a_key_that_nobody_subscribes_to_is_named_with_what_to_do() -> None:
     assert told == "our relay has just seen its worker's subscriptions"
     node.handle(ev.SlotReady(task="merge", epoch=1), 104.0)
     assert build_snapshot(node, 110.0).tasks[0].problems == ()
-
-
-def test_how_long_streams_wait_does_not_begin_again_when_the_relay_says_why() -> None:
-    node = make()
-    learn(node, 1, "edge1")
-    node.handle(ev.SlotReady(task="merge", epoch=1), 100.0)
-    node.handle(ev.SlotFlipped(task="merge", epoch=1), 100.0)
-    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False), 110.0)
-    node.handle(ev.SlotReady(task="merge", epoch=1, is_ready=False, has_token=False), 111.0)
-    assert build_snapshot(node, 114.0).tasks[0].problems == (
-        f"this robot's streams have waited for edge1 for 4 s: our relay does not see its worker's token{LOOK}",
-    )
-
-
-def test_what_was_missed_has_an_age_and_what_a_rule_wants_has_none() -> None:
-    node = make()
-    for now, (thinned, lost, at_most) in (
-        (100.0, (5, 0, 0)),
-        (110.0, (9, 2, 0)),
-        (120.0, (12, 2, 0)),
-        (130.0, (12, 2, 7)),
-    ):
-        wanted = StreamCount(stream="merge/in/0", drops=(("thinned", thinned),))
-        missed = StreamCount(stream="merge/in/1", lost=lost, at_most_lost=at_most)
-        node.handle(ev.StreamsCounted(counts=(wanted, missed)), now)
-        ages = [count.dropped_s for count in build_snapshot(node, now + 5.0).tasks[0].streams]
-        assert ages == [None, None if not lost else {110.0: 5.0, 120.0: 15.0, 130.0: 5.0}[now]]
 
 
 def test_a_stream_grows_older_while_the_relay_tells_nothing() -> None:
@@ -1129,22 +1002,7 @@ def test_drops_have_an_age_and_an_input_its_way_in() -> None:
     assert count.dropped_s is None, "another relay counts, and has dropped nothing"
 
 
-# --- the line --------------------------------------------------------------------------------------------------------
-
-
-def test_line_names_role_peers_and_owners() -> None:
-    node = make()
-    learn(node, 3, "edge2")
-    assert status_line(node) == "robot robot1 · 3/5 nodes · merge@edge2 epoch 3 · merge2@nobody epoch 0"
-
-
 # --- tasks -----------------------------------------------------------------------------------------------------------
-
-
-def test_task_without_an_owner_says_none_and_has_no_age() -> None:
-    task = build_snapshot(make(), 130.0).tasks[0]
-    assert (task.owner, task.owner_state, task.since_s, task.phase) == (None, "none", None, "idle")
-    assert (task.revision, task.epoch, task.history) == (0, 0, ())
 
 
 def test_task_shows_its_owner_how_it_is_seen_since_when_and_the_handover() -> None:
@@ -1157,15 +1015,6 @@ def test_task_shows_its_owner_how_it_is_seen_since_when_and_the_handover() -> No
     ]
 
 
-def test_new_weights_are_history_and_no_move() -> None:
-    node = make()
-    learn(node, 3, "edge2", 100.0)
-    learn(node, 4, "edge2", 101.0, epoch=3)
-    task = build_snapshot(node, 101.0).tasks[0]
-    assert (task.revision, task.epoch, task.since_s) == (4, 3, 1.0)
-    assert [(past.revision, past.epoch) for past in task.history] == [(3, 3), (4, 3)]
-
-
 def test_history_is_bounded() -> None:
     node = make()
     for revision in range(1, 101):
@@ -1175,72 +1024,7 @@ def test_history_is_bounded() -> None:
     assert history[-1].revision == 100
 
 
-def test_streams_stand_under_their_own_task_only() -> None:
-    node = make()
-    counts = tuple(StreamCount(stream=name) for name in ("merge/in/0", "merge2/in/0", "merge/out/0", "other/in/0"))
-    node.handle(ev.StreamsCounted(counts=counts), 100.0)
-    merge, merge2 = build_snapshot(node, 100.0).tasks
-    assert [count.stream for count in merge.streams] == ["merge/in/0", "merge/out/0"]
-    assert [count.stream for count in merge2.streams] == ["merge2/in/0"]
-
-
-def test_vote_shows_who_proposed_whom() -> None:
-    node = make()
-    paper = proposal_of("robot2")
-    node.handle(ev.ProposalReceived(proposal=paper), 100.0)
-    vote = build_snapshot(node, 100.5).tasks[0].vote
-    assert vote is not None
-    assert (vote.votes, vote.outcome, vote.winner) == ((("robot2", "edge1"),), "pending", None)
-    assert vote.age_s == pytest.approx(0.5)
-
-
 # --- nodes -----------------------------------------------------------------------------------------------------------
-
-
-def test_a_decision_and_a_vote_have_an_age() -> None:
-    node = make()
-    learn(node, 1, "edge1")
-    paper = proposal_of("robot2", base_revision=1)
-    assert not paper.is_escape, "unless it says so"
-    for _ in range(2):
-        node.handle(ev.DeadlineReached(), node.rounds.next_deadline())
-    judged_at = node.rounds.tasks["merge"].judged_at
-    decision = build_snapshot(node, judged_at + 1.5).tasks[0].decision
-    assert decision is not None
-    assert decision.age_s == pytest.approx(1.5)
-    assert build_explanation(node, "merge", judged_at + 0.5).age_s == pytest.approx(0.5)
-
-
-def test_nodes_never_heard_are_listed_without_figures() -> None:
-    snapshot = build_snapshot(make(alive=("robot2",)), 100.0)
-    by_name = {node.name: node for node in snapshot.nodes}
-    assert list(by_name) == sorted((*ROBOTS, *EDGES))
-    edge = by_name["edge1"]
-    assert (edge.state, edge.age_s, edge.incarnation, edge.cpu_ratio) == ("unknown", None, None, None)
-    assert (by_name["robot2"].state, by_name["robot2"].incarnation) == ("alive", 3)
-    assert (by_name["robot1"].state, by_name["robot1"].incarnation) == ("alive", 7)
-
-
-def test_ratios_are_bounded_and_none_when_not_measured() -> None:
-    node = make()
-    profile = profile_of(incarnation=3, cpu_cores=2.0, cpu_used_cores=2.5, memory_mb=1000, memory_used_mb=None)
-    node.handle(ev.ProfileReceived(profile=profile), 100.0)
-    edge = build_snapshot(node, 100.25).nodes[0]
-    assert (edge.cpu_ratio, edge.memory_ratio, edge.age_s) == (1.0, None, 0.25)
-    for sequence, cpu, memory, ratios in ((2, 0.5, 250.0, (0.25, 0.25)), (3, 1.0, 1200.0, (0.5, 1.0))):
-        later = replace(profile, sequence=sequence, cpu_used_cores=cpu, memory_used_mb=memory)
-        node.handle(ev.ProfileReceived(profile=later), 100.25)
-        edge = build_snapshot(node, 100.25).nodes[0]
-        assert (edge.cpu_ratio, edge.memory_ratio) == ratios
-
-
-def test_counters_of_all_parts_stand_in_one_sorted_list() -> None:
-    node = make()
-    node.handle(ev.FrameDropped(kind="beat", reason="size"), 100.0)
-    node.handle(ev.LearntReceived(learnt=Learnt(node="ghost", values=()), is_answer=True), 100.0)
-    assert build_snapshot(node, 100.0).counters == (("dropped_beat_size", 1), ("learnt_foreign", 1))
-    node.handle(ev.FrameDropped(kind="beat", reason="rate", count=70), 100.0)
-    assert dict(build_snapshot(node, 100.0).counters)["dropped_beat_rate"] == 70
 
 
 def test_a_command_is_told_with_the_name_of_its_certificate() -> None:

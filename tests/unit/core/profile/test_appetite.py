@@ -40,10 +40,6 @@ def test_a_thread_that_has_been_busy_for_a_moment_wants_no_core_yet() -> None:
     assert looked(1 + round(APPETITE_S)).wanted_cores() is None
 
 
-def test_a_thread_that_has_just_begun_hides_no_older_one() -> None:
-    assert looked(20, with_new=True).wanted_cores() == pytest.approx(1.1, abs=0.01)
-
-
 def test_a_look_at_the_same_moment_changes_nothing() -> None:
     appetite = looked(20)
     appetite.look({HUNGRY: (1e6, 1e6)}, 20.0)

@@ -70,12 +70,6 @@ def told(meter: JobMeter | None = None) -> Teller:
     return Teller(meter or JobMeter(1.0))
 
 
-def test_before_its_first_job_a_worker_has_told_nothing() -> None:
-    teller = told()
-    assert teller.meter.value is None
-    assert teller.works(1.0, done_hz=0.0) is None
-
-
 def test_means_are_per_job_and_rates_per_second() -> None:
     jobs = told().works(20.0, done_hz=5.0, skipped_hz=2.5)
     assert jobs is not None

@@ -52,10 +52,6 @@ def taken(profiler: Profiler, now: float, states: dict[str, WorkerState] | None 
 # --- smoothing by elapsed time -------------------------------------------------------------------------------------
 
 
-def test_first_sample_is_taken_as_it_is() -> None:
-    assert Ewma(3.0).update(0.7, now=100.0) == 0.7
-
-
 def test_a_step_is_followed_by_63_percent_in_one_time_constant_whatever_the_rate() -> None:
     """alpha = 1 - exp(-dt / tau): samples at uneven times give the same mean as samples at even ones."""
     for times in ((3.0,), (0.5, 3.0), tuple(0.2 * i for i in range(1, 16)), (0.01, 2.9, 2.95, 3.0)):
@@ -85,13 +81,6 @@ def test_a_worker_without_a_figure_uses_nothing_for_that_sample() -> None:
     assert worker.memory_mb == pytest.approx(200.0 * math.exp(-1.0))
 
 
-def test_before_the_first_sample_there_is_no_profile_however_due() -> None:
-    profiler = make_profiler()
-    assert profiler.publishable(READY, is_draining=True, now=100.0) is None
-    profiler.absorb(device(), (), 100.1)
-    assert taken(profiler, 100.1).cpu_used_cores == 1.0
-
-
 # --- signals -------------------------------------------------------------------------------------------------------
 
 
@@ -103,11 +92,6 @@ def test_impossible_signals_are_dropped(impossible: float) -> None:
     signal.update(-60.0, now=0.2)
     assert signal.update(impossible, now=0.4) == -60.0
     assert signal.dropped == 2
-
-
-@pytest.mark.parametrize("possible", [-10.0, -99.0])
-def test_the_edges_of_what_is_possible_pass(possible: float) -> None:
-    assert SignalFilter(3.0).update(possible, now=0.0) == possible
 
 
 def test_a_single_outlier_is_dropped_and_a_lasting_jump_believed_after_three() -> None:
@@ -185,10 +169,6 @@ def test_what_a_driver_makes_up_is_not_measured() -> None:
 # --- the machine and its workers -----------------------------------------------------------------------------------
 
 
-def test_nothing_is_published_before_the_first_sample() -> None:
-    assert make_profiler().publishable(READY, is_draining=False, now=0.0) is None
-
-
 def test_the_first_cpu_reading_is_not_measured_rather_than_zero() -> None:
     profiler = make_profiler()
     profiler.absorb(device(cpu=None), (), now=0.0)
@@ -245,15 +225,6 @@ def test_what_a_worker_starts_or_stops_to_use_never_shows_in_the_rest(*, already
         assert profile.memory_used_mb is not None
         assert profile.cpu_used_cores - (own.cpu_cores or 0.0) == pytest.approx(expected)
         assert profile.memory_used_mb - (own.memory_mb or 0.0) == pytest.approx(rest_memory)
-
-
-def test_a_worker_that_was_never_measured_has_no_figure() -> None:
-    profiler = make_profiler()
-    profiler.absorb(device(2.0, 1000.0, load(None, None)), (), now=0.0)
-    profiler.absorb(device(2.0, 1000.0, load(None, None)), (), now=0.2)
-
-    profile = taken(profiler, 0.2)
-    assert profile.worker("merge") == load(None, None)
 
 
 def test_states_come_from_the_node_not_from_the_sample() -> None:

@@ -59,11 +59,6 @@ def test_a_change_that_stays_is_the_new_rest() -> None:
     assert next_s(pace, loaded, 101.0 + CHANGING_S) == REST_S
 
 
-def test_ticks_are_no_change() -> None:
-    pace = at_rest()
-    assert next_s(pace, replace(IDLE, cpu_used_cores=0.4, memory_used_mb=1010.0), 101.0) == REST_S
-
-
 def test_a_worker_whose_use_was_not_measured_is_not_at_work() -> None:
     unknown = replace(IDLE, workers=(replace(IDLE.workers[0], cpu_cores=None),))
     assert next_s(at_rest(), unknown, 101.0) == REST_S
@@ -91,13 +86,3 @@ def test_work_that_is_told_begins_the_quick_pace() -> None:
 def test_a_radio_is_measured_often_at_all_times() -> None:
     pace = at_rest()
     assert pace.next_s(IDLE, (LinkSample(source=LinkSource.NL80211),), 101.0, is_watched=False) == PERIOD_S
-
-
-def test_clocks_that_must_be_watched_are() -> None:
-    assert next_s(at_rest(), IDLE, 101.0, is_watched=True) == PERIOD_S
-
-
-def test_a_fleet_with_a_longer_period_keeps_it() -> None:
-    pace = Sampling(period_s=2.0)
-    next_s(pace, IDLE, 100.0)
-    assert next_s(pace, IDLE, 110.0) == 2.0

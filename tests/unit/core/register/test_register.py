@@ -196,15 +196,6 @@ def test_crash_between_promise_and_acceptance_cannot_commit_two_values() -> None
 # --- learner and identity rounds -------------------------------------------------------------------------------------
 
 
-def test_learn_only_rises() -> None:
-    register = make("edge")
-    step = did(register.learn, allocation(2), 0.0)
-    assert step.learnt == allocation(2)
-    assert did(register.learn, allocation(1, "e9"), 0.0) == Step()
-    assert did(register.learn, allocation(2), 0.0) == Step()
-    assert make("edge", state=register.state, incarnation=2).value == allocation(2)
-
-
 def test_two_values_for_one_revision_are_reported_and_the_first_stays() -> None:
     register = make()
     did(register.learn, allocation(2), 0.0)
@@ -299,12 +290,6 @@ def test_who_hears_of_a_later_generation_forgets_what_another_fleet_has_learnt()
     assert register.value == allocation(4)
 
 
-def test_time_alone_changes_nothing_where_nothing_waits() -> None:
-    register = make("r1")
-    assert register.next_deadline() == math.inf
-    assert did(register.tick, 1e9) == Step()
-
-
 def test_settle_leaves_a_round_under_way_alone() -> None:
     register = make()
     did(register.propose, FIRST, 0.0)
@@ -331,15 +316,6 @@ def test_majority_that_has_forgotten_a_learnt_value_is_reported_and_nothing_move
 
 
 # --- time and hostile peers ------------------------------------------------------------------------------------------
-
-
-def test_deadline_during_a_round_is_the_rounds_own() -> None:
-    """An identity round that is due waits for the round under way; its deadline in the past would spin the loop."""
-    register = make()
-    accepted(register, accept(1, allocation(1)), 0.0)
-    due = register.next_deadline()
-    did(register.propose, replace(FIRST, base_revision=1), due - 0.01)
-    assert register.next_deadline() > due
 
 
 def test_duelling_proposers_part() -> None:

@@ -42,15 +42,6 @@ from zsched.core.values.model import Acceptance, Allocation
 # --- proposer --------------------------------------------------------------------------------------------------------
 
 
-def test_move_commits_by_a_majority_and_is_learnt() -> None:
-    electors = [make(name) for name in ELECTORS]
-    step = commit(electors[0], did(electors[0].propose, FIRST, 0.0), electors[:2])
-    assert step.finished == (FIRST, RoundOutcome.COMMITTED)
-    assert step.learnt == allocation(1)
-    assert electors[0].value == allocation(1)
-    assert not electors[0].is_busy
-
-
 def test_minority_does_not_commit() -> None:
     electors = tuple(f"r{i}" for i in range(1, 6))
     registers = [make(name, electors=electors) for name in electors]
@@ -209,13 +200,6 @@ def test_change_on_a_base_that_nobody_has_ends_as_conflict() -> None:
     change = replace(FIRST, base_revision=4)
     step = promise_all(electors[0], did(electors[0].propose, change, 0.0), electors)
     assert step.finished == (change, RoundOutcome.CONFLICT)
-
-
-def test_outdated_change_ends_at_once_without_a_ballot() -> None:
-    register = make(state=replace(BLANK, learnt=allocation(3)))
-    step = did(register.propose, replace(FIRST, base_revision=2), 0.0)
-    assert step.prepare is None
-    assert step.finished == (replace(FIRST, base_revision=2), RoundOutcome.CONFLICT)
 
 
 def test_every_queued_change_reports_its_own_end() -> None:

@@ -39,10 +39,3 @@ def test_the_gap_of_a_move_is_news_once() -> None:
     assert gaps.absorb([first], 102.0) == ()
     second = counted(0.1, 0.3, 3)
     assert gaps.absorb([second], 103.0) == (second,)
-
-
-def test_a_stream_that_is_gone_is_forgotten() -> None:
-    gaps = StreamGaps()
-    gaps.absorb([counted(0.1)], 100.0)
-    gaps.absorb([], 101.0)
-    assert gaps.of(STREAM, 101.0) is None

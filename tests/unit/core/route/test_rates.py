@@ -31,9 +31,3 @@ def test_another_relay_counts_from_zero() -> None:
     assert rates.of("echo/in/0", 102.0) is None
     rates.absorb([StreamCount(stream="echo/in/0", messages=17, bytes=170)], 103.0)
     assert rates.of("echo/in/0", 103.0) == (10.0, 100.0)
-
-
-def test_a_stream_that_is_gone_is_forgotten() -> None:
-    rates = fed((100.0, 5), (101.0, 6))
-    rates.absorb([], 102.0)
-    assert rates.of("echo/in/0", 102.0) is None

@@ -62,16 +62,6 @@ def test_a_service_is_shown_to_the_robot_and_its_clients_to_the_worker() -> None
     )
 
 
-def test_what_does_not_belong_to_the_stream_is_not_shown() -> None:
-    others = {one(MP, "robot1/scan"), one(MS, "robot1/map"), one(SS, "robot1/map"), one(MP, "robot2/map")}
-    assert mirrored([INPUT], Sides(local=frozenset(others), fleet=frozenset())) == NOBODY
-
-
-def test_many_publishers_of_one_kind_are_one() -> None:
-    seen = Sides(local=frozenset({one(MP, "robot1/map")} | {one(MP, "robot1/map", "other")}), fleet=frozenset())
-    assert len(mirrored([INPUT], seen).fleet) == 2  # one for each QoS
-
-
 def test_a_worker_with_plain_keys_is_stood_in_for() -> None:
     plain = route(Direction.INPUT, f"0/robot1/map/{TYPE}/*", "edge1/m/robot1/map")
     seen = Sides(local=frozenset({one(MP, "robot1/map")}), fleet=frozenset())

@@ -7,14 +7,13 @@ from dataclasses import replace
 import pytest
 
 from support.fleets import fleet_of, task_of
-from zsched.core.route.route import plan_for, slot_for, watch_for
+from zsched.core.route.route import slot_for, watch_for
 from zsched.core.values.fleet import Fleet, Standby, StreamRule, TaskSpec, WorkerSpec
 from zsched.core.values.plan import (
     Direction,
     HandoverRule,
     ReadyWhen,
     RosGraph,
-    RoutePhase,
     StreamClass,
     StreamSettings,
 )
@@ -57,14 +56,6 @@ def test_stream_names_outlive_owners_and_epochs() -> None:
     assert all(name.startswith("merge/") for name in names)
 
 
-@pytest.mark.parametrize("phase", RoutePhase)
-def test_only_a_closing_plan_drops_the_predecessors(phase: RoutePhase) -> None:
-    old, new = slot_for(SPEC, "robot1", "edge1", 1), slot_for(SPEC, "robot1", "edge2", 2)
-    plan = plan_for(SPEC, phase, new, (old,))
-    assert (plan.task, plan.phase, plan.current) == ("merge", phase, new)
-    assert plan.predecessors == (() if phase is RoutePhase.CLOSE else (old,))
-
-
 # --- what the relay looks after, whoever owns the task ---------------------------------------------------------------
 
 
@@ -87,14 +78,6 @@ def test_a_worker_without_a_token_is_watched_where_it_may_run_over_all_robots() 
     robot = watch_for(fleet(spec), spec, "robot1")
     assert robot is not None
     assert (robot.inputs, robot.services) == ((), ()), "no candidate"
-
-
-def test_a_worker_with_a_token_is_not_watched() -> None:
-    spec = replace(SPEC, worker=WorkerSpec())
-    assert watch_for(fleet(spec), spec, "edge1") is None
-    robot = watch_for(fleet(spec), spec, "robot1")
-    assert robot is not None
-    assert (robot.inputs, robot.services) == ((), ())
 
 
 @pytest.mark.parametrize("ready", ReadyWhen)

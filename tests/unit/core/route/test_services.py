@@ -6,7 +6,6 @@ from support.fleets import tuning_of
 from zsched.config.load import CheckResult, check_bytes
 from zsched.config.rulecheck import rule_conflicts
 from zsched.core.route.route import routes_for
-from zsched.core.route.templates import template_fault
 from zsched.core.values.fleet import StreamRule, TaskSpec
 from zsched.core.values.plan import Direction, ServiceSettings
 
@@ -75,11 +74,6 @@ def test_a_service_that_cannot_work_is_refused_at_its_place(service: str, said: 
     assert result.fleet is None
     assert said in result.report()
     assert all(fault.line == 11 for fault in result.faults), result.report()
-
-
-def test_a_service_needs_no_robot_behind_the_target() -> None:
-    assert template_fault("{target}/now", SERVICE, "to") is None
-    assert rule_conflicts([task_of(("{robot}/now", "{target}/work"))], ROBOTS) == ()
 
 
 def test_services_that_ask_each_other_are_a_loop() -> None:

@@ -84,22 +84,6 @@ def test_filled_rules_are_valid_and_within_what_they_may_become(robot: str, owne
             assert keyexpr.includes(widened(template, robot=robot, node=robot, target=owner, task=name), expr)
 
 
-GOOD = [
-    (IN, "from", "{robot}/map"),
-    (IN, "from", "weather/now"),
-    (IN, "from", "0/{robot}/map/nav_msgs::msg::dds_::OccupancyGrid_/RIHS01_00"),
-    (IN, "to", "{target}/{task}/{robot}/map"),
-    (IN, "to", "p_{target}/{node}"),
-    (OUT, "from", "{target}/{task}/{epoch}/tf"),
-    (OUT, "from", "{target}/{task}/{robot}/tf"),
-    (OUT, "to", "{robot}/tf"),
-    (OUT, "to", "{node}/tf"),
-    (OUT, "to", "global_map"),
-    (IN, "from", "{robot}/sensors/**"),
-    (IN, "from", "{robot}/cam$*/*/raw"),
-    (IN, "to", "{target}/{task}/{robot}/sensors/**"),
-    (OUT, "from", "{target}/{task}/{epoch}/**"),
-]
 BAD = [
     (IN, "from", "{target}/map", "whoever owns"),
     (IN, "from", "{epoch}/map", "only the 'from' of an output"),
@@ -122,11 +106,6 @@ BAD = [
     (IN, "to", "{target}/**/*", "'*/**'"),
     (IN, "from", "", "empty"),
 ]
-
-
-@pytest.mark.parametrize(("direction", "side", "template"), GOOD)
-def test_template_in_its_place_is_fine(direction: Direction, side: str, template: str) -> None:
-    assert template_fault(template, direction, side) is None
 
 
 @pytest.mark.parametrize(("direction", "side", "template", "said"), BAD)
@@ -163,11 +142,6 @@ def test_wildcards_stay_in_routes_and_widened_templates_stay_canonical() -> None
     assert (route.from_expr, route.to_expr) == ("robot1/s/**", "edge1/t/robot1/**")
     assert widened("{target}/**/{robot}", target="edge1") == "edge1/*/**"
     assert widened("in{robot}{target}/map") == "in$*/map", "two open names in one chunk are one wildcard"
-
-
-def test_fill_without_a_name_raises() -> None:
-    with pytest.raises(KeyError):
-        fill("{robot}/map", target="edge1")
 
 
 def test_examples_in_the_module_hold() -> None:

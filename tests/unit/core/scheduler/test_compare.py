@@ -10,7 +10,7 @@ from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.standing import Standing, compare, pick, rounded
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Reach, Utility, UtilityVector
+from zsched.core.values.model import Reach, UtilityVector
 from zsched.core.values.quorum import majority
 
 SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=tuning_of(cpu=1.0, memory=0.0))
@@ -37,28 +37,6 @@ def test_columns_are_averaged_over_the_robots() -> None:
     assert standing.aggregates == {"edge1": pytest.approx(0.4), "edge2": pytest.approx(0.2)}
     assert {name: str(veto) for name, veto in standing.vetoed.items()} == {"edge3": "not scored by enough robots"}
     assert standing.voters_heard == 3
-
-
-def test_a_robot_counts_once_per_candidate_however_often_it_names_it() -> None:
-    shouted = tuple(Utility(candidate="edge2", value=1.0) for _ in range(9))
-    liar = replace(vote("r3", edge1=0.0), utilities=(Utility(candidate="edge1", value=0.0), *shouted))
-    standing = joined(vote("r1", edge1=0.6, edge2=0.1), vote("r2", edge1=0.6, edge2=0.1), liar)
-
-    assert standing.aggregates == {"edge1": pytest.approx(0.4), "edge2": pytest.approx(0.4)}
-
-
-def test_vectors_under_another_revision_are_not_counted() -> None:
-    standing = joined(vote("r1", edge1=0.2), vote("r2", edge1=0.8, revision=6), vote("r3", edge1=0.8, revision=8))
-
-    assert (standing.voters_heard, standing.aggregates) == (1, {"edge1": 0.2})
-
-
-def test_unreachable_is_zero_in_the_mean_and_not_absent() -> None:
-    standing = joined(
-        vote("r1", edge1=0.9, edge2=0.5), vote("r2", edge1=0.9, edge2=0.5), vote("r3", edge1=GONE, edge2=0.5)
-    )
-
-    assert standing.aggregates == {"edge1": pytest.approx(0.6), "edge2": pytest.approx(0.5)}
 
 
 @pytest.mark.parametrize(

@@ -198,17 +198,6 @@ def test_a_leader_is_told_what_else_it_waits_for(held_by: dict[str, Any], told_o
     assert not any(text.startswith("until") for text in free)
 
 
-def test_who_refuses_a_candidate_is_told_with_why() -> None:
-    decision = decision_of()
-    first = decision.figures.vectors[0]
-    others = tuple(one for one in first.utilities if one.candidate != "edge2")
-    refusing = replace(first, utilities=others, refused=(("edge2", "its worker failed"),))
-    vectors = (refusing, *decision.figures.vectors[1:])
-    told = explained(judged_again(decision, replace(decision.figures, vectors=vectors)))
-    (edge2,) = (one for one in told.candidates if one.node == "edge2")
-    assert [(view.robot, view.refused) for view in edge2.robots if view.refused] == [("robot1", "its worker failed")]
-
-
 def test_without_the_owner_the_best_of_the_others_gets_the_task() -> None:
     decision = decision_of()
     again = judged_again(decision, without(decision.figures, "edge1"))

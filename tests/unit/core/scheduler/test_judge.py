@@ -21,7 +21,6 @@ from zsched.core.scheduler.judge import (
     escape_reason,
 )
 from zsched.core.scheduler.standing import LOST_S, Standing, compare
-from zsched.core.values.absence import Absences
 from zsched.core.values.fleet import TaskSpec, WorkerSpec
 from zsched.core.values.model import Allocation, Asked, Pause, PeerState, Pin
 from zsched.core.values.profile import Profile, WorkerState
@@ -118,13 +117,6 @@ def test_where_a_move_is_free_the_first_lead_is_followed() -> None:
     assert judged(Judge(spec=replace(SPEC, price_s=0.0)), BETTER, 0.0).outcome is Outcome.PROPOSE
 
 
-def test_a_new_owner_has_its_own_start_up_time() -> None:
-    judge = Judge(spec=SPEC, absences=Absences(since=0.0))
-    judge.reset(is_new_owner=True)
-
-    assert judge.absences.since is None
-
-
 def away(judge: Judge, *turns: tuple[WorkerState, float], start: float = 0.0) -> list[float]:
     """Of each look, for how long the owner's worker was away; it is in each state for so many seconds."""
     found, now = [], start
@@ -201,14 +193,6 @@ def test_an_owner_that_the_robots_lose_again_and_again_is_lost() -> None:
     assert other.lost_for(False, 11.0) == judge.lost_for(False, 11.0) > LOST_S
 
 
-def test_what_is_held_against_a_worker_is_part_of_the_memory() -> None:
-    judge, other = Judge(spec=SPEC), Judge(spec=SPEC)
-    away(judge, *OFTEN)
-    other.recall(judge.memory())
-    starting = profile(state=WorkerState.STARTING)
-    assert other.not_ready_for(starting, 47.0) == judge.not_ready_for(starting, 47.0) > 14.0
-
-
 def test_for_how_long_the_owner_is_not_reached_begins_anew_with_each_time_and_each_owner() -> None:
     judge, other = Judge(spec=SPEC), Judge(spec=SPEC)
     assert [judge.lost_for(is_reached, now) for is_reached, now in ((True, 0.0), (False, 1.0), (False, 2.5))] == [
@@ -240,10 +224,6 @@ def test_an_escape_without_anywhere_to_go_proposes_nothing() -> None:
     judgement = judged(Judge(spec=SPEC), {"edge1": 0.9}, 0.0, escape="edge1 is gone")
 
     assert (judgement.outcome, judgement.candidate, judgement.is_escape) == (Outcome.NONE, "edge1", False)
-
-
-def test_nobody_scored_is_no_decision() -> None:
-    assert judged(Judge(spec=SPEC), {}, 0.0).outcome is Outcome.NONE
 
 
 # --- called votes --------------------------------------------------------------------------------------------------
@@ -310,11 +290,6 @@ def test_a_paused_task_stays_whatever_happens(escape: str | None, *, called: boo
     assert judgement.reason == "paused by ada@robot1 (new battery)"
     held = judged(Judge(spec=SPEC), BETTER, 0.0, escape=escape, agreed=pinned_to("edge2", is_paused=True))
     assert held.outcome is Outcome.STAY, "a pause comes before a pin"
-
-
-def test_a_paused_task_without_an_owner_gets_none() -> None:
-    judgement = judged(Judge(spec=SPEC), BETTER, 0.0, called=True, agreed=allocation(None, paused=True))
-    assert (judgement.outcome, judgement.candidate) == (Outcome.STAY, None)
 
 
 @pytest.mark.parametrize("called", [True, False])
@@ -483,12 +458,6 @@ def test_an_owner_that_is_not_ready_is_only_said_to_be_left_when_somebody_else_c
     assert stays == "the worker on edge1 is starting; nobody else can have the task"
 
 
-@pytest.mark.parametrize("held", [allocation(paused=True), pinned_to("edge1", is_hard=True)])
-def test_an_owner_that_is_held_is_not_said_to_be_left(held: Allocation) -> None:
-    starting = profile(state=WorkerState.STARTING)
-    assert not escape_ahead(SPEC, held, starting, 0.0, has_other=True)
-
-
 def test_of_an_owner_without_a_profile_or_a_word_of_its_foreign_worker_nothing_is_foretold() -> None:
     assert not escape_ahead(SPEC, allocation(), None, 0.0, has_other=True)
     assert not escape_ahead(FOREIGN, allocation(), profile(state=None), 0.0, has_other=True)
@@ -598,15 +567,6 @@ def test_a_vote_that_was_lost_forgives_what_was_owed_and_a_gap_in_the_judgements
     judge = Judge(spec=DEAR)
     assert judged(judge, slighter, 100.0).outcome is Outcome.WAIT
     assert judged(judge, slighter, 900.0).outcome is Outcome.WAIT, "nobody looked for so long"
-
-
-def test_what_is_owed_is_part_of_the_memory() -> None:
-    judge, other = Judge(spec=DEAR), Judge(spec=DEAR)
-    for tick in range(4):
-        judged(judge, {"edge1": 0.5, "edge2": 0.7}, tick / 2)
-    other.recall(judge.memory())
-    assert other.ledger == judge.ledger
-    assert other.ledger.owed["edge1"] == pytest.approx(0.15, rel=0.01)
 
 
 # --- an operator's drain ---------------------------------------------------------------------------------------------

@@ -80,13 +80,6 @@ def test_an_owner_that_cannot_be_scored_tells_nothing() -> None:
     assert worth_of_edge2(kept, 1.0) == 0.9
 
 
-def test_it_is_a_value_and_nothing_is_known_of_a_node_that_is_no_more() -> None:
-    kept = gave((1.5, 0.5))
-    assert Kept.of(kept.memory()) == kept
-    kept.keep(("edge1",))
-    assert ({*kept.seen}, {*kept.foretold}) == ({"edge1"}, {"edge1"})
-
-
 def test_a_machine_that_failed_counts_as_half_of_what_it_promised_and_again_half() -> None:
     kept = Kept()
     look(kept, HOME, "edge1", 0.0)

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from support.allocations import allocation_of
 from support.fleets import fleet_of, task_of, tuning_of
@@ -89,10 +87,6 @@ def test_a_way_that_is_not_measured_yet_counts_as_the_longest_that_is(known_s: f
     assert worth(away_s=(None, known_s)) == worth(away_s=(known_s, known_s))
 
 
-def test_where_no_way_is_measured_none_counts() -> None:
-    assert worth(away_s=(None, None)) == worth(away_s=(0.0, 0.0))
-
-
 def test_of_ways_only_those_to_candidates_that_are_heard_count_for_others() -> None:
     """Neither what is no candidate, nor who is gone for a day, says how far away a candidate is."""
     assert worth(away_s=(0.03, None), away={"robot1": 9.0, "robot2": 9.0}) == worth(away_s=(0.03, 0.03))
@@ -148,8 +142,3 @@ def test_a_task_whose_worker_tells_nothing_is_judged_by_service() -> None:
 def test_the_paper_s_score_knows_no_deadline() -> None:
     paper = replace(TUNING, score=ScoreForm.PAPER)
     assert worth(paper, speeds=(1.0, 4.0)) == worth(replace(paper, deadline_ms=None), speeds=(1.0, 4.0))
-
-
-@given(one_s=st.floats(0.0, 1e6), more_s=st.floats(0.0, 1e6), deadline_s=st.floats(0.001, 3600.0))
-def test_longer_jobs_are_never_more_in_time(one_s: float, more_s: float, deadline_s: float) -> None:
-    assert 0.0 <= on_time(one_s + more_s, deadline_s) <= on_time(one_s, deadline_s) <= 1.0

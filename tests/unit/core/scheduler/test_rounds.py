@@ -142,15 +142,6 @@ def test_gather_closes_at_its_deadline_and_names_the_silent() -> None:
     assert robot.task.silent == ("robot2",)
 
 
-def test_gather_does_not_wait_for_a_robot_that_goes_meanwhile() -> None:
-    robot = Robot()
-    robot.tick()
-    robot.hear("robot3", 1)
-    robot.states["robot2"] = PeerState.SUSPECT
-    robot.tick(0.01)
-    assert robot.task.judged_at == robot.now
-
-
 def asks(robot: Robot, rounds: int, **cpu: float) -> int:
     """How often a robot asks in so many rounds, with a profile of everybody before each; all answer."""
     found = 0
@@ -394,14 +385,6 @@ def test_one_paper_per_vote_however_often_it_is_called() -> None:
     robot.paper("robot2", "edge2")
     assert proposed(robot.round()) == ["edge1"]
     robot.paper("robot3", "edge2")
-    assert proposed(robot.round()) == []
-
-
-def test_a_proposal_to_stay_calls_nobody() -> None:
-    robot = Robot()
-    robot.round()
-    assert robot.paper("robot2", "edge1") == []
-    assert robot.voting.opened_at is None
     assert proposed(robot.round()) == []
 
 
@@ -704,15 +687,6 @@ def test_a_vote_that_others_have_won_takes_the_room_too() -> None:
 
 
 # --- edges -----------------------------------------------------------------------------------------------------------
-
-
-def test_edges_have_no_rounds() -> None:
-    robot = Robot("edge1")
-    assert robot.decider.next_deadline() == math.inf
-    robot.rounds.hurry(robot.now)
-    assert robot.decider.next_deadline() == math.inf
-    assert robot.tick(1.0) == []
-    assert robot.rounds.vectors({"merge": robot.value}, robot.states, robot.now) == Utilities(voter="edge1", vectors=())
 
 
 def test_while_an_owner_s_worker_is_not_ready_the_decision_says_when_it_will_be_left_and_why() -> None:

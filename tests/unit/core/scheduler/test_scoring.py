@@ -142,15 +142,6 @@ def test_an_owner_has_the_memory_that_it_holds_though_not_all_of_it_shows_as_its
 # --- who is scored -------------------------------------------------------------------------------------------------
 
 
-def test_vector_names_voter_task_and_revision_and_is_sorted() -> None:
-    vector = scored(ROBOT, *reversed(EDGES))
-
-    assert (vector.voter, vector.task, vector.revision) == ("robot1", "merge", 7)
-    assert values(vector) == {"edge1": 0.25, "edge2": 0.5, "edge3": 0.75}
-    assert list(values(vector)) == sorted(values(vector))
-    assert vector.refused == ()
-
-
 def test_a_candidate_never_heard_is_left_out_for_the_listener_may_have_just_started() -> None:
     vector = scored(ROBOT, *EDGES, states={"edge2": PeerState.UNKNOWN})
 
@@ -387,13 +378,6 @@ def test_the_owner_keeps_its_place_while_its_worker_restarts(state: WorkerState)
     assert "edge1" in values(scored(ROBOT, profile("edge1", state=state), *EDGES[1:]))
 
 
-@pytest.mark.parametrize("state", [WorkerState.STARTING, WorkerState.STOPPED, WorkerState.READY])
-def test_a_cold_standby_is_startable_and_therefore_scored(state: WorkerState) -> None:
-    cold = replace(SPEC, worker=WorkerSpec(command=("worker",), standby=Standby.COLD))
-
-    assert "edge2" in values(scored(ROBOT, EDGES[0], profile("edge2", state=state), spec=cold))
-
-
 @pytest.mark.parametrize("standby", Standby)
 def test_a_foreign_worker_needs_no_process_of_ours_but_must_be_there(standby: Standby) -> None:
     foreign = replace(SPEC, worker=WorkerSpec(standby=standby))
@@ -466,11 +450,6 @@ def test_a_machine_that_took_the_task_without_room_for_all_that_it_held_keeps_it
     vector = score(spec, allocation(owner="edge2"), "robot1", gateway, states, 0.2)
 
     assert "edge2" in values(vector)
-
-
-def test_memory_that_is_not_measured_refuses_nobody() -> None:
-    spec = replace(SPEC, demand=Demand(memory_mb=500.0))
-    assert "edge1" not in dict(scored(ROBOT, profile("edge1", memory=None), spec=spec).refused)
 
 
 def test_memory_that_its_own_worker_holds_counts_as_free_for_the_task() -> None:
@@ -664,19 +643,6 @@ def terms_of(vector: UtilityVector) -> dict[str, dict[str, float]]:
     return {one.candidate: dict(one.gauges) for one in vector.utilities}
 
 
-@pytest.mark.parametrize("form", list(ScoreForm))
-def test_a_weighed_gauge_is_a_term_like_the_others(form: ScoreForm) -> None:
-    agreed = weighed(cpu=0.5, battery=0.5)
-    agreed = replace(agreed, tuning=replace(agreed.tuning, score=form))
-    vector = scored(gauged("edge1", battery=0.3), gauged("edge2", battery=0.9), agreed=agreed)
-
-    assert terms_of(vector) == {"edge1": {"battery": 0.3}, "edge2": {"battery": 0.9}}
-    low, high = (one.value for one in vector.utilities)
-    assert high > low
-    plain = [one.value for one in scored(gauged("edge1", battery=0.3), gauged("edge2", battery=0.9)).utilities]
-    assert plain[0] == plain[1], "without a weight it counts nothing"
-
-
 def test_a_node_without_a_gpu_cannot_have_a_task_that_weighs_it_and_one_without_a_battery_counts_as_full() -> None:
     spec = replace(SPEC, demand=Demand(gpu=0.1))
     vector = scored(gauged("edge1", gpu=0.5), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.5), spec=spec)
@@ -717,11 +683,6 @@ def test_a_limit_holds_also_for_a_reader_that_has_failed() -> None:
         "edge1": "battery was last at 15 %, limit 20 %",
         "edge2": "temperature_c was last at 91 °C, limit 85 °C",
     }
-
-
-def test_a_gauge_that_nobody_measures_is_left_out() -> None:
-    with_weight = scored(gauged("edge1"), gauged("edge2"), agreed=weighed(cpu=0.5, gpu=0.3, battery=0.2))
-    assert [one.value for one in with_weight.utilities] == [one.value for one in scored(gauged("edge1")).utilities] * 2
 
 
 def test_a_demand_of_the_gpu_is_predicted_for_every_candidate_alike() -> None:
@@ -794,20 +755,6 @@ def test_a_limit_of_the_gpu_tells_what_the_task_would_make_of_it() -> None:
         "edge2": "gpu would be at 120 %, limit 90 %",
         "edge3": "gpu is not measured",
     }
-
-
-@pytest.mark.parametrize(
-    ("gauges", "why"),
-    [
-        ({"battery": 0.19}, "battery is at 19 %, limit 20 %"),
-        ({"battery": 0.2}, ""),
-        ({}, ""),
-        ({"temperature_c": 91.0}, "temperature_c is at 91 °C, limit 85 °C"),
-    ],
-)
-def test_limits_refuse_the_owner_too(gauges: dict[str, float], why: str) -> None:
-    spec = replace(SPEC, gauge_limits=(("battery", 0.2), ("temperature_c", 85.0)))
-    assert dict(scored(gauged("edge1", **gauges), spec=spec).refused).get("edge1", "") == why
 
 
 @pytest.mark.parametrize("agreed", [allocation(), allocation(owner=None)])

@@ -37,10 +37,6 @@ class Task:
         return self.bound_for
 
 
-def test_nobody_waits_while_nothing_moves() -> None:
-    assert who_moves_first({"a": Task(), "b": Task()}, "b", is_called=False, now=2.0) is None
-
-
 def test_a_planned_move_waits_for_an_open_vote_and_for_a_commit() -> None:
     for moving in (Task(opened_at=1.0), Task(commit="move"), Task(awaited_until=2.1)):
         assert who_moves_first({"a": moving, "b": Task()}, "b", is_called=False, now=2.0) == "a"
@@ -226,10 +222,6 @@ def test_what_it_lacks_counts_as_coming_as_soon_as_the_machine_has_room_for_it()
 
 def test_a_task_that_has_just_come_to_a_full_machine_counts_until_it_shows_that_it_lacks_cpu() -> None:
     assert terms_of_a(used=2.0, of_a=1.0, of_b=0.0)[0] == pytest.approx(service_utility(0.0, 2.0, 2.0))
-
-
-def test_a_single_task_has_no_bookings() -> None:
-    assert book((A,), values("edge1")) == {}
 
 
 # --- GPUs ------------------------------------------------------------------------------------------------------------

@@ -151,13 +151,6 @@ def test_a_token_that_is_away_for_a_moment_now_and_then_is_no_reason() -> None:
     assert come_and_go(robot, 20, away_s=4.0, there_s=41.0) == [set()] * 40
 
 
-def test_a_worker_that_is_not_ready_has_no_time_running() -> None:
-    robot = Robot("edge2")
-    robot.pass_time(UNSEEN_S - 1.0)
-    assert robot.look("edge2") == set()
-    assert robot.pass_time(UNSEEN_S - 1.0) == set()
-
-
 def test_a_new_relay_tells_its_tokens_anew() -> None:
     robot = Robot("edge2")
     robot.pass_time(UNSEEN_S)
@@ -205,12 +198,3 @@ def test_nothing_is_told_any_more_of_a_task_whose_workers_show_no_token_from_now
     robot.spec = replace(TASK, worker=WorkerSpec(command=("true",), standby=Standby.COLD))
     assert robot.look() == set()
     assert robot.unseen.found == {"merge": set()}
-
-
-def test_a_task_that_is_gone_is_forgotten() -> None:
-    robot = Robot("edge2")
-    robot.pass_time(UNSEEN_S)
-    robot.here.take(replace(robot.here.fleet, tasks=(OTHER,)))
-    assert robot.unseen.found == {}
-    robot.here.take(replace(robot.here.fleet, tasks=(TASK, OTHER)))
-    assert robot.pass_time(UNSEEN_S - 0.01) == set()

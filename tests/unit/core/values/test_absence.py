@@ -64,12 +64,6 @@ def test_time_of_which_nobody_knows_counts_as_neither(is_away: bool) -> None:
     assert known.held_s(LIMIT_S) > 5.0
 
 
-def test_one_of_which_nobody_has_known_anything_has_not_been_away() -> None:
-    absences = Absences()
-    absences.skip(100.0)
-    assert absences.look(True, 101.0, LIMIT_S) == 0.0
-
-
 def test_it_is_held_only_by_more_than_the_limit() -> None:
     absences = Absences()
     looked(absences, (True, 10.0), (False, 0.5))

@@ -9,19 +9,16 @@ from support.fleets import tuning_of
 from zsched.core.values.fleet import (
     TUNED_LINKS,
     TUNED_RULES,
-    Demand,
     Fleet,
-    LinkLimits,
     LinkSpec,
     NodeSpec,
     StreamRule,
     TaskSpec,
     Timing,
-    WorkerSpec,
     electorate_hash,
     fleet_hash,
 )
-from zsched.core.values.model import NodeKind, Reach, Weights
+from zsched.core.values.model import NodeKind, Reach
 from zsched.core.values.plan import Direction
 from zsched.core.values.profile import LinkSource
 
@@ -47,22 +44,9 @@ FLEET = Fleet(
 )
 
 
-def test_defaults_are_the_design_s_first_ones() -> None:
-    assert (TUNING.bonus, TASK.price_s, TASK.memory_s) == (0.10, 0.3, 1000.0)
-    assert LinkLimits() == LinkLimits(nu_dbm=-80.0, rho_dbm=-40.0)
-    timing = Timing()
-    assert (timing.sample_s, timing.smoothing_s) == (0.2, 0.3)
-    assert (timing.beat_s, timing.suspect_s) == (0.2, 1.2)
-    assert WorkerSpec().command == ()
-
-
 @pytest.mark.parametrize(("ballot_s", "order_s"), [(0.01, 3.0), (0.3, 4.2), (1.0, 14.0), (3600.0, 60.0)])
 def test_an_order_is_waited_for_by_the_fleet_s_timing_within_bounds(ballot_s: float, order_s: float) -> None:
     assert Timing(ballot_s=ballot_s).order_s == pytest.approx(order_s)
-
-
-def test_voters_are_the_robots_only() -> None:
-    assert FLEET.voters == ("robot1", "robot2")
 
 
 def test_node_and_task_are_found_by_name_or_raise() -> None:
@@ -72,35 +56,6 @@ def test_node_and_task_are_found_by_name_or_raise() -> None:
         FLEET.node("edge9")
     with pytest.raises(KeyError):
         FLEET.task("other")
-
-
-@pytest.mark.parametrize(("cpu", "memory"), [(-1.0, 0.0), (0.0, -1.0), (5000.0, 0.0), (float("nan"), 0.0)])
-def test_impossible_demand_is_refused(cpu: float, memory: float) -> None:
-    with pytest.raises(ValueError, match=r"^demand\."):
-        Demand(cpu_cores=cpu, memory_mb=memory)
-
-
-def _other_weights() -> Fleet:
-    tuning = replace(TUNING, weights=Weights(cpu=0.6, memory=0.4, network=0.0))
-    return replace(FLEET, tasks=(replace(TASK, tuning=tuning),))
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        replace(FLEET, name="lab2"),
-        replace(FLEET, timing=replace(Timing(), beat_s=0.1)),
-        replace(FLEET, nodes=FLEET.nodes[:3]),
-        replace(FLEET, nodes=(replace(FLEET.nodes[0], labels=(("gpu", "yes"),)), *FLEET.nodes[1:])),
-        replace(FLEET, tasks=(replace(TASK, candidates=("edge1",)),)),
-        replace(FLEET, tasks=(replace(TASK, rules=()),)),
-        replace(FLEET, electors=("edge1", "robot1", "robot2")),
-        replace(FLEET, zenoh_config="/etc/zsched/other.json5"),
-        _other_weights(),
-    ],
-)
-def test_fleet_hash_tells_different_fleets_apart(other: Fleet) -> None:
-    assert fleet_hash(other) != fleet_hash(FLEET)
 
 
 def test_fleet_hash_ignores_where_the_files_lie() -> None:

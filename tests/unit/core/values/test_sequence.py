@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from zsched.core.values.sequence import RATE_HZ, RUN, STEP, WINDOW, Order, Track
+from zsched.core.values.sequence import RATE_HZ, RUN, WINDOW, Order, Track
 
 
 def track(sequence: int = 100, incarnation: int = 7) -> Track:
@@ -17,13 +17,6 @@ def judged(one: Track, *numbers: int, at: float = 10.0, incarnation: int = 7) ->
     """Each number, a tenth of a second after the one before."""
     times = enumerate(numbers)
     return [one.judge(incarnation, number, at + index / 10, may_begin=False) for index, number in times]
-
-
-@pytest.mark.parametrize("incarnation", [0, 1])
-def test_the_first_message_counts_and_the_next_is_held_against_it(incarnation: int) -> None:
-    one = Track()
-    assert one.judge(incarnation, 5, 10.0, may_begin=False) is Order.NEW
-    assert one.judge(incarnation, 10**9, 10.0, may_begin=False) is Order.DOUBTFUL
 
 
 @pytest.mark.parametrize(
@@ -71,19 +64,6 @@ def test_a_sender_whose_number_was_overtaken_is_believed_again_by_its_third_mess
     assert RUN == 3
     assert judged(one, 101, 102, 103) == [Order.OLD, Order.OLD, Order.NEW]
     assert judged(one, 104, 105, at=10.4) == [Order.NEW, Order.NEW]
-
-
-@pytest.mark.parametrize(
-    ("numbers", "is_believed"),
-    [
-        ((10**6, 10**6 + STEP, 10**6 + 2 * STEP), True),
-        ((10**6, 10**6 + STEP + 1, 10**6 + STEP + 2), False),
-        ((10**6, 10**6, 10**6 + 1), False),
-        ((10**6, 10**6 - 1, 10**6), False),
-    ],
-)
-def test_a_course_is_messages_in_a_row(numbers: tuple[int, ...], is_believed: bool) -> None:
-    assert (judged(track(), *numbers)[-1] is Order.NEW) is is_believed
 
 
 def test_a_course_is_of_one_life() -> None:
