@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from support.waiting import until
-from zsched.core.values.errors import AdapterError
 from zsched_lab.fleet.groups import LimitedGroup
 from zsched_lab.fleet.janitor import clean, groups_of
-from zsched_lab.fleet.limits import LimitKind, NodeLimits, by_affinity, make_limits
+from zsched_lab.fleet.limits import LimitKind, by_affinity, make_limits
 
 BUSY = [sys.executable, "-c", "while True: pass"]
 WHY_NOT = LimitedGroup.why_not(memory=False)
@@ -73,11 +72,3 @@ def test_without_groups_each_edge_gets_a_cpu() -> None:
         busy.wait()
     assert len(first) == len(second) == 1
     assert first != second
-
-
-def test_a_process_that_is_gone_cannot_be_put() -> None:
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    limits = NodeLimits(LimitKind.AFFINITY, "", cpus={"edge1": min(os.sched_getaffinity(0))})
-    with pytest.raises(AdapterError, match=str(gone.pid)):
-        limits.put("edge1", gone.pid)

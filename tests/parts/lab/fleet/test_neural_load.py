@@ -14,11 +14,8 @@ import pytest
 from zsched_lab.fleet.neural_load import (
     LoadOptions,
     candidates,
-    fit,
     frames,
     load_network,
-    package_file,
-    parse,
     run,
     synthetic_network,
 )
@@ -46,37 +43,10 @@ def test_the_detector_looks_at_a_whole_frame() -> None:
     assert np.isfinite(result).all()
 
 
-def test_a_package_or_file_that_is_not_there_is_none() -> None:
-    assert package_file("zsched_has_no_such_package", "*.onnx") is None
-    assert package_file("zsched", "*.onnx") is None
-
-
-def test_the_last_resort_computes_and_calls_itself_synthetic() -> None:
-    network = synthetic_network()
-
-    assert "synthetic" in network.name
-    assert network.infer(frames(32)[0]) != network.infer(frames(32)[1])
-
-
-def test_frames_are_cut_and_tiled_to_a_fixed_input() -> None:
-    frame = frames(32)[0]
-
-    assert fit(frame, [0, 3, 0, 0]) is frame
-    assert fit(frame, [1, 3, 224, 224]).shape == (1, 3, 224, 224)
-    assert fit(frame, [4, 3, 16, 32]).shape == (4, 3, 16, 32)
-
-
 def test_a_set_frame_rate_is_kept() -> None:
     total = run(synthetic_network(), LoadOptions(hz=20.0, side=32, duration_s=0.5), StopFlag(), lambda _: None)
 
     assert 1 <= total <= 12
-
-
-@pytest.mark.parametrize("wrong", [["--threads", "0"], ["--side", "100"], ["--hz", "-1"]])
-def test_wrong_options_exit_2(wrong: list[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        parse(wrong)
-    assert caught.value.code == 2
 
 
 def test_it_reports_each_second_and_stops_on_sigterm(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from zsched.config.load import load_fleet
-from zsched.core.values.errors import ConfigError
 from zsched.host.operator_client import ask
 from zsched.tasks.map_merge.geometry import Pose2
 from zsched_lab.demo.run import fleet_template, worker_options
@@ -16,7 +15,7 @@ from zsched_lab.fleet.children import ChildError, Children
 from zsched_lab.fleet.injector import Injector
 from zsched_lab.fleet.limits import LimitKind, NodeLimits
 from zsched_lab.fleet.observer import Observer
-from zsched_lab.fleet.runner import FleetRunner, LabFleet, with_options, write_fleet
+from zsched_lab.fleet.runner import FleetRunner, LabFleet, write_fleet
 from zsched_lab.fleet.schedule import Injection
 
 STUB = (sys.executable, str(Path(__file__).parent / "stub_daemon.py"))
@@ -62,14 +61,6 @@ def children(tmp_path: Path) -> Iterator[Children]:
     assert children.left_behind == []
 
 
-def test_options_of_the_worker_give_way_to_the_runs() -> None:
-    command = ["python", "--mode", "known", "--rate", "2", "--pose", "a=0,0,0", "--pose", "b=0,0,0"]
-
-    assert with_options(command, {"--mode": ("estimate",), "--pose": ()}) == [
-        "python", "--rate", "2", "--mode", "estimate",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize("mode", ["known", "track", "estimate"])
 def test_the_demos_effective_file_is_a_valid_fleet_of_its_own_ports(tmp_path: Path, mode: str) -> None:
     lab = write_fleet(fleet_template(), tmp_path / "fleet.yaml", worker_options(mode, FRAMES))
@@ -85,13 +76,6 @@ def test_the_demos_effective_file_is_a_valid_fleet_of_its_own_ports(tmp_path: Pa
     assert command[command.index("--mode") + 1] == mode
     poses = [word for word in command if word.startswith("robot")]
     assert poses == ([] if mode == "estimate" else ["robot1=1.500000,-2.000000,0.250000000"])
-
-
-@pytest.mark.parametrize("text", ["[", "fleet: x", "nodes: {}\ntasks: {}"])
-def test_a_damaged_template_is_told(tmp_path: Path, text: str) -> None:
-    (tmp_path / "bad.yaml").write_text(text)
-    with pytest.raises(ConfigError, match=r"bad\.yaml"):
-        write_fleet(tmp_path / "bad.yaml", tmp_path / "fleet.yaml", {})
 
 
 def test_a_fleet_comes_up_is_watched_loaded_and_ends(fleet: LabFleet, children: Children, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from zsched.config.load import load_fleet
 from zsched.core.values.errors import AdapterError
-from zsched.core.values.model import NodeKind
 from zsched.host.state_file import StateFile
 from zsched_lab.fleet import testbed
 from zsched_lab.fleet.loopback import own_address
@@ -41,22 +40,6 @@ def test_file_is_valid_and_every_session_has_a_port_of_its_own(tmp_path: Path) -
     endpoints = [end for node in bed.fleet.nodes for end in (node.listen_control, node.listen_data)]
     assert len(set(endpoints)) == 12
     assert all(end.startswith(f"tcp/{own_address()}:") for end in endpoints)
-
-
-def test_file_can_be_asked_for_otherwise(tmp_path: Path) -> None:
-    tree = echo_fleet(
-        robots=2,
-        edges=0,
-        timing="wired",
-        scheduling={"bonus": 0.2},
-        weights={"cpu": 1.0, "memory": 0.0, "network": 0.0},
-        task={"exclusive": False},
-    )
-    fleet = Testbed(tmp_path, tree).fleet
-    assert {node.kind for node in fleet.nodes} == {NodeKind.ROBOT}
-    task = fleet.task(TASK)
-    assert (fleet.timing.name, task.tuning.bonus, task.tuning.weights.cpu) == ("wired", 0.2, 1.0)
-    assert task.candidates == ("robot1", "robot2"), "without edges the robots are candidates"
 
 
 def test_init_gives_every_node_a_state_of_its_own(tmp_path: Path) -> None:

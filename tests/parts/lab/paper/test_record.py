@@ -34,8 +34,6 @@ from zsched_lab.paper.record import (
     HostGauge,
     NodeMeter,
     StreamFile,
-    idle_ticks,
-    parse_pressure,
     record,
     stamp_ns,
 )
@@ -128,21 +126,6 @@ def test_a_robot_that_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.M
 
 
 # --- accounting ------------------------------------------------------------------------------------------------------
-
-
-def test_pressure_is_read_from_the_line_of_some() -> None:
-    text = "some avg10=1.00 avg60=0.00 avg300=0.00 total=12345\nfull avg10=0.00 avg60=0.00 avg300=0.00 total=6\n"
-
-    assert parse_pressure(text) == 12345
-    with pytest.raises(ValueError, match="some"):
-        parse_pressure("full avg10=0.00 total=6\n")
-
-
-def test_idle_ticks_go_on() -> None:
-    idle, total = idle_ticks()
-    time.sleep(0.1)
-
-    assert idle_ticks()[1] > total >= idle
 
 
 @pytest.fixture

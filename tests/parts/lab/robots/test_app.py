@@ -15,9 +15,7 @@ from support.waiting import free_endpoint
 from zsched.tasks.map_merge.cdr import decode_grid
 from zsched_lab.fleet.recorder import read_records
 from zsched_lab.maps.laser_log import LaserLog, load_log, malaga_path
-from zsched_lab.robots.app import Drive, parse
-
-REQUIRED = ["--robot", "robot1", "--endpoint", "tcp/127.0.0.1:1", "--records", "records"]
+from zsched_lab.robots.app import Drive
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +36,6 @@ def test_a_drive_gives_each_scan_once_in_order_within_the_replay(malaga: LaserLo
     assert taken == list(malaga.scans[1:])
     assert drive.due(1e9) is None
     assert drive.wait_s(0.0) == float("inf")
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        ["--index", "3", "--robots", "3"],
-        ["--index", "-1", "--robots", "3"],
-        ["--index", "0", "--robots", "3", "--replay-s", "0"],
-    ],
-)
-def test_wrong_options_exit_2(wrong: list[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        parse([*REQUIRED, *wrong])
-    assert caught.value.code == 2
 
 
 def peer(endpoint: str) -> zenoh.Session:
