@@ -184,9 +184,11 @@ class Judge:
         is_drain = escape is None and bool(drained)
         leaving = f"{owner} is {drained}" if is_drain else escape
         told = {name: value + head_starts.get(name, 0.0) for name, value in standing.aggregates.items()}
-        self.kept.look(told, owner, now)
-        worth = self.kept.corrected(told, owner, self.spec.memory_s, now)
-        unkept = {name: told[name] - value for name, value in worth.items() if value < told[name]}
+        machines = told if standing.machines is None else {name: standing.machines[name] for name in told}
+        self.kept.look(machines, owner, now)
+        kept = self.kept.corrected(machines, owner, self.spec.memory_s, now)
+        unkept = {name: machines[name] - value for name, value in kept.items() if value < machines[name]}
+        worth = {name: value - unkept.get(name, 0.0) for name, value in told.items()}
         if owner in worth:
             worth[owner] += allocation.tuning.bonus
         home = allocation.home

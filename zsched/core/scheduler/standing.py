@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+from zsched.core.scheduler.utility import Total
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Allocation, NodeId, Reach, Utility, UtilityVector
+from zsched.core.values.model import Allocation, NodeId, Reach, Tuning, Utility, UtilityVector
 from zsched.core.values.quorum import majority
 from zsched.core.values.struct import Struct, replace
 from zsched.core.values.veto import Filter, Veto
@@ -40,6 +41,8 @@ class Standing(Struct, frozen=True, kw_only=True):
     vetoed: Mapping[NodeId, Veto]
     vectors: tuple[UtilityVector, ...]
     voters_heard: int
+    machines: Mapping[NodeId, float] | None = None
+    """{candidate: its aggregate without the network: a signal is no promise}; ``None``: the task weighs no network."""
 
     def kept_out_by(self, node: NodeId | None) -> Filter | None:
         """Which filter keeps ``node`` out; ``None``: none does."""
@@ -103,6 +106,7 @@ def compare(
             kept.append(candidate)
     return Standing(
         aggregates=_aggregates(kept, rows),
+        machines=_machines(kept, rows, allocation.tuning) if allocation.tuning.weights.network else None,
         vetoed=vetoed,
         vectors=fresh,
         voters_heard=len(fresh),
@@ -144,6 +148,17 @@ def _aggregates(candidates: list[NodeId], rows: Sequence[_Row]) -> dict[NodeId, 
     told = _comparable(candidates, rows)
     columns = {name: [row[name].value for row in told if name in row] for name in candidates}
     return {name: math.fsum(column) / len(column) for name, column in columns.items()}
+
+
+def _machines(candidates: list[NodeId], rows: Sequence[_Row], tuning: Tuning) -> dict[NodeId, float]:
+    """What candidates are worth wherever the robots are; 1 where nothing but the network counts.
+
+    By one robot's word: all have it of the candidate's profile.
+    """
+    said = {name: next(row[name].terms for row in rows if name in row) for name in candidates}
+    measured = {metric for terms in said.values() for metric, term in terms.items() if term is not None}
+    total = Total(tuning.weights, measured - {"network"}, tuning.score)
+    return {name: 1.0 if (value := total.of(terms)) is None else value for name, terms in said.items()}
 
 
 def pick(aggregates: Mapping[NodeId, float], owner: NodeId | None) -> NodeId | None:

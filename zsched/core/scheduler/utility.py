@@ -171,7 +171,7 @@ class Total:
         weighed = [weight for _, weight in self._shares]
         self._whole = sum(weighed, 0.0) if self._is_sum else max(weighed, default=1.0)
 
-    def of(self, terms: Mapping[str, float]) -> float | None:
+    def of(self, terms: Mapping[str, float | None]) -> float | None:
         """The utility in [0, 1]; ``None`` when a weighted metric that others have is missing, or nothing is left.
 
         ``terms``: {metric: eta, sigma, kappa or a gauge's term, each in [0, 1]}, of those that are measured here.

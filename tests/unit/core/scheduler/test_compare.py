@@ -10,7 +10,7 @@ from support.fleets import task_of, tuning_of
 from support.proposals import vector_of
 from zsched.core.scheduler.standing import Standing, compare, pick, rounded
 from zsched.core.values.fleet import TaskSpec
-from zsched.core.values.model import Reach, UtilityVector
+from zsched.core.values.model import Reach, ScoreForm, Tuning, Utility, UtilityVector, Weights
 from zsched.core.values.quorum import majority
 
 SPEC = task_of(candidates=("edge1", "edge2", "edge3"), tuning=tuning_of(cpu=1.0, memory=0.0))
@@ -133,3 +133,22 @@ def test_a_candidate_gains_nothing_by_a_far_robot_that_leaves_it_out() -> None:
     found = joined(*first, vote("r3", edge1=0.3, edge2=0.2, edge3=0.2), *last)
     assert found.aggregates == {"edge1": pytest.approx(0.7), "edge2": pytest.approx(0.4)}, "one robot scores both"
     assert {name: str(veto) for name, veto in found.vetoed.items()} == {"edge3": "not scored by enough robots"}
+
+
+@pytest.mark.parametrize(
+    ("cpu", "machines"), [(0.5, {"edge1": 0.8, "edge2": 0.6}), (0.0, {"edge1": 1.0, "edge2": 1.0})]
+)
+def test_what_a_machine_is_worth_by_itself_does_not_follow_its_signal(cpu: float, machines: dict[str, float]) -> None:
+    """A robot that drives away has broken no promise: on recorded drives such tasks stayed 1.1 dB farther away."""
+    weights = Weights(cpu=cpu, memory=0.0, network=1.0 - cpu)
+    agreed = allocation_of(7, epoch=3, tuning=Tuning(weights=weights, score=ScoreForm.SERVICE))
+    for signal in (0.9, 0.3):
+        utilities = tuple(
+            Utility(candidate=name, value=signal / 2, cpu=own, network=signal)
+            for name, own in (("edge1", 0.8), ("edge2", 0.6))
+        )
+        vectors = {
+            name: UtilityVector(voter=name, task="merge", revision=7, utilities=utilities) for name in ("r1", "r2")
+        }
+        assert compare(SPEC, agreed, vectors).machines == machines
+    assert joined(vote("r1", edge1=0.9), vote("r2", edge1=0.1)).machines is None, "without a weight of the network"
