@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -139,6 +140,45 @@ def test_what_live_nodes_say_is_read_and_said_again_to_the_letter(domain: str) -
         assert value is not None
         assert value.sequence >= 1
         assert encode_attachment(value).hex() == raw
+
+
+RELEASES = json.loads((Path(__file__).parent / "words" / "releases.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("of", RELEASES, ids=[str(number) for number in range(len(RELEASES))])
+def test_tokens_of_each_release_are_read_and_said_again(of: dict[str, Any]) -> None:
+    """The words file names the source of each form."""
+    for token, expected in of["tokens"].items():
+        assert str(zenoh.KeyExpr(token)) == token
+        parsed = parse_token(token)
+        if expected is None:
+            assert parsed is None, token
+            continue
+        kind, key, type_name, qos = expected
+        endpoint = Endpoint(kind=EndpointKind(kind), key=key, type_name=type_name, qos=qos)
+        assert parsed is not None, token
+        assert parsed[1] == endpoint
+        graph = RosGraph.ROS2DDS if token.startswith("@/") else RosGraph.RMW_ZENOH
+        ours = endpoint_token(graph, endpoint, zid="5eed", node="zsched_robot1", number=7)
+        assert parse_token(ours) == ("5eed", endpoint)
+        assert not qos or parse_token(f"{token}/later") == parsed, "what follows is tolerated"
+
+
+def test_keys_beside_a_topic_with_buffers_are_told_apart_from_topics() -> None:
+    """buffer_endpoint_helpers.hpp of rmw_zenoh at b84b89eed63a91f6ec63ee34f173d2433ba3fcf4."""
+    assert is_rmw_key(CHATTER)
+    assert ros2.has_buffers_beside(RosGraph.RMW_ZENOH, CHATTER)
+    for beside in (ros2.BUFFERS, f"/_buf/{'0f' * 16}"):
+        assert not is_rmw_key(CHATTER + beside)
+    assert not ros2.has_buffers_beside(RosGraph.ROS2DDS, "robot1/map")
+
+
+def test_the_attachment_with_names_of_before_the_first_release_is_none() -> None:
+    """attachment_helpers.cpp of rmw_zenoh at 038b5a4fbb337e8033a7474a4a788fa381204c3c."""
+    named = ("sequence_number", zenoh.ext.Int64(1)), ("source_timestamp", zenoh.ext.Int64(2))
+    raw = b"".join(zenoh.ext.z_serialize(one).to_bytes() for pair in named for one in pair)
+    raw += zenoh.ext.z_serialize("source_gid").to_bytes() + zenoh.ext.z_serialize(bytes(16)).to_bytes()
+    assert decode_attachment(raw) is None
 
 
 @pytest.mark.parametrize(("graph", "token"), [(RosGraph.RMW_ZENOH, SUBSCRIPTION), (RosGraph.ROS2DDS, BRIDGED)])
