@@ -17,7 +17,7 @@ from zsched.core.scheduler.utility import service_utility
 from zsched.core.values.fleet import Demand, TaskSpec, WorkerSpec
 from zsched.core.values.in_force import InForce
 from zsched.core.values.model import PeerState, ScoreForm, Tuning, Utility, Weights
-from zsched.core.values.profile import WorkerLoad, WorkerState
+from zsched.core.values.profile import MAX_CPU_CORES, WorkerLoad, WorkerState
 
 TASKS = tuple(
     task_of(name, ("edge1",), worker=WorkerSpec(command=("work",)), demand=Demand(cpu_cores=0.5, memory_mb=200.0))
@@ -224,6 +224,7 @@ def test_whatever_a_profile_tells_a_robot_can_score() -> None:
         for task in tasks:
             gateway.learn_demand(task.name, "edge1", float(sequence))
     for task in tasks:
+        assert gateway.demand(task, idle).cpu_cores <= MAX_CPU_CORES, "a decision that is told holds it"
         agreed = allocation_of(owner="edge1", task=task.name)
         vector = score(task, agreed, "robot1", gateway, states, 1.5, {"edge1": tasks, "edge2": tasks})
         assert {one.candidate for one in vector.utilities} | {name for name, _ in vector.refused} == {"edge1", "edge2"}

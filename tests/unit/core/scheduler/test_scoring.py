@@ -793,3 +793,11 @@ def test_from_an_owner_far_beyond_its_limit_a_task_goes_inside_the_margin_too(
     assert "edge1" in dict(vector.refused)
     assert ("edge2" in dict(vector.refused)) == is_refused
     assert "edge3" in dict(scored(gauged("edge1", battery=battery), gauged("edge3", battery=0.19), spec=spec).refused)
+
+
+def test_no_margin_holds_a_task_on_an_owner_that_can_hold_no_lease() -> None:
+    spec = replace(SPEC, gauge_limits=(("battery", 0.2),))
+    told = (gauged("edge1", battery=0.9), gauged("edge2", battery=0.22))
+    unfit = Doubts(unfit={"edge1": Veto(Filter.LEASE, "clock in doubt")})
+    assert "edge2" not in values(scored(ROBOT, *told, spec=spec))
+    assert "edge2" in values(scored(ROBOT, *told, spec=spec, doubts=unfit))
