@@ -205,7 +205,7 @@ def test_a_role_whose_token_goes_is_told_again_by_the_relay(tmp_path: Path) -> N
         def is_told_again() -> bool:
             nonlocal worker
             until(works, "the token of the role")
-            until(lambda: told[-1].epoch == 2, "the role, behind all that was put before")
+            until(lambda: told and told[-1].epoch == 2, "the role, behind all that was put before")
             told.clear()
             worker.kill()
             with contextlib.suppress(AssertionError):
