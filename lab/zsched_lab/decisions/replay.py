@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from random import Random
 
-from zsched.core.values.fleet import Fleet, LinkLimits
+from zsched.core.values.fleet import Fleet
 from zsched.core.values.model import Weights
 from zsched_lab.decisions.rules import Move, Rule
 from zsched_lab.decisions.view import START_S, Feed, Look, Sight, View
-from zsched_lab.decisions.world import DT_S, World, with_task
+from zsched_lab.decisions.world import DT_S, World, weighing
 
 TICKS = 2
 """Per step: robots' rounds come between the readings, too."""
@@ -28,18 +28,17 @@ class Entry:
     look: Look = Look()
     weights: Weights | None = None
     """``None``: the task's own."""
-    limits: LinkLimits | None = None
 
 
 def replay(world: World, entries: tuple[Entry, ...], seed: int = 0) -> Mapping[str, list[Move]]:
     """{entry: its moves}, after one pass over the history."""
     feeds = {look: Feed(world, look) for look in dict.fromkeys(entry.look for entry in entries)}
-    views: dict[tuple[Look, Weights | None, LinkLimits | None], View] = {}
+    views: dict[tuple[Look, Weights | None], View] = {}
     rules: dict[str, Rule] = {}
     for entry in entries:
-        key = (entry.look, entry.weights, entry.limits)
+        key = (entry.look, entry.weights)
         if key not in views:
-            views[key] = View(with_task(world, weights=entry.weights, limits=entry.limits), feeds[entry.look])
+            views[key] = View(weighing(world, entry.weights), feeds[entry.look])
         rules[entry.name] = entry.make(views[key])
     due = rounds(world.fleet, world.steps, seed)
     for tick in range(world.steps * TICKS):

@@ -98,7 +98,7 @@ def swept() -> tuple[Case, ...]:
 
 
 def options() -> tuple[Case, ...]:
-    """What might be better than the paper's: readings of a pair, dear moves."""
+    """What might be better than the paper's: links between robots, dear moves."""
     return (
         Case(name="robots", build=_robots, cast=lambda world, _seed: entries.readings(world), hours=1.0),
         *(_costly(cost_s) for cost_s in COSTS_S),

@@ -4,7 +4,7 @@ Knows: sampling, smoothing, publication, gathers without loss. Does not know: ru
 
 Every robot receives every profile at once, so one gateway stands for all; each robot has its own utilities, for its
 links are its own. What is seen does not depend on the owner (its own load is subtracted), so all rules that want
-the same smoothing, weights and limits share one `View`.
+the same smoothing and weights share one `View`.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Feed:
 
 
 class View:
-    """What the robots make of a feed, under one task's weights and limits."""
+    """What the robots make of a feed, under one task's weights."""
 
     def __init__(self, world: World, feed: Feed) -> None:
         self.fleet, self.gateway = feed.fleet, feed.gateway

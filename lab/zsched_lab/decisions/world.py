@@ -245,9 +245,8 @@ def _smooth(values: Array, window_s: float = 11.0) -> Array:
     return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
 
 
-def with_task(world: World, *, weights: Weights | None = None, limits: LinkLimits | None = None) -> World:
-    """The same history under other weights or limits."""
+def weighing(world: World, weights: Weights | None) -> World:
+    """The same history under other weights; ``None``: under the task's own."""
     spec = world.spec
     tuning = spec.tuning if weights is None else replace(spec.tuning, weights=weights)
-    task = replace(spec, tuning=tuning, limits=limits or spec.limits)
-    return replace(world, fleet=replace(world.fleet, tasks=(task,)))
+    return replace(world, fleet=replace(world.fleet, tasks=(replace(spec, tuning=tuning),)))

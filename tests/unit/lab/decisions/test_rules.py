@@ -128,7 +128,7 @@ def test_zsched_in_the_comparison_is_what_a_fleet_file_gets_that_names_the_paper
     assert isinstance(rule, CoreRule)
     settings = replace(task.tuning, weights=rule.tuning.weights)
     assert (rule.tuning, rule.price_s, rule.memory_s) == (settings, task.price_s, task.memory_s)
-    assert zsched.limits in (None, task.limits)
+    assert world.spec.limits == task.limits
     assert zsched.look == Look(smoothing_s=result.fleet.timing.smoothing_s)
 
 
