@@ -5,27 +5,23 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-VENV = ROOT / ".venv-ros"
-SIDE = Path(__file__).with_name("side")
+from support.ros_fleet import PYTHON, SIDE, VENV
 
 
 class Ros:
     """Runs programs of ``side/`` with ROS 2."""
 
     def __init__(self) -> None:
-        self.python = VENV / "bin" / "python"
         self.share = VENV / "share"
 
     def ask(self, program: str, question: Any) -> Any:
         """What a program answers to one question; both are JSON."""
         done = subprocess.run(
-            [self.python, SIDE / program],
+            [PYTHON, SIDE / program],
             input=json.dumps(question),
             capture_output=True,
             text=True,

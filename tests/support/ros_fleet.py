@@ -25,7 +25,8 @@ from zsched_lab.fleet.testbed import Testbed, echo_fleet
 
 ROOT = Path(__file__).parents[2]
 SIDE = ROOT / "tests" / "ros" / "side"
-PYTHON = ROOT / ".venv-ros" / "bin" / "python"
+VENV = ROOT / ".venv-ros"
+PYTHON = VENV / "bin" / "python"
 ROBOT, EDGES = "robot1", ("edge1", "edge2")
 MEMORY = Path("/dev/shm")  # noqa: S108 - the kernel's name for it
 DOMAINS = range(20, 100)

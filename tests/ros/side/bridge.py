@@ -172,7 +172,7 @@ class Bridge:
         return end
 
     def _serve_ros(self, name: str, type_name: str) -> Callable[[], None]:
-        """A local node asks; whoever is not answered waits for ever, as with the plugin."""
+        """A local node asks; a request without an answer waits for ever, as with the plugin."""
         kind = kind_of(type_name)
         count = 0
 

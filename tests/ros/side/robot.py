@@ -81,7 +81,7 @@ class Robot:
     def hear(self, word: str) -> None:
         """In the thread that reads stdin."""
         name, _, rest = word.partition(" ")
-        opposite = {"quiet": "talk", "silent": "ask", "blind": "look"}
+        opposite = {"quiet": "talk", "silent": "ask"}
         if name in opposite:
             self._words.discard(opposite[name])
         elif name == "goal":
@@ -130,14 +130,13 @@ class Robot:
         self.told["calls"].append(future.result().message)
 
     def _send(self, order: int) -> None:
-        goal: dict[str, Any] = {"order": order, "feedback": 0, "accepted": None, "status": None, "result": None}
+        goal: dict[str, Any] = {"order": order, "feedback": 0, "status": None, "result": None}
         self.told["goals"].append(goal)
 
         def on_feedback(message: Any) -> None:
             goal["feedback"] = max(goal["feedback"], len(message.feedback.sequence))
 
         def on_accepted(future: Any) -> None:
-            goal["accepted"] = future.result().accepted
             if future.result().accepted:
                 future.result().get_result_async().add_done_callback(on_result)
 
