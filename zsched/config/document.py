@@ -48,7 +48,7 @@ def read_document(content: Document, fleet: str, node: NodeId, config: Path) -> 
 
 
 def _secures(config: Path, fleet: str) -> bool:
-    """Whether the machine's own file secures this fleet; it is read anew, for who ends that changes it first.
+    """Whether the machine's own file secures this fleet. It is read anew: an operator who ends that changes it first.
 
     One that cannot be used says nothing: no daemon starts by it.
     """

@@ -1,7 +1,7 @@
 """The file that brings a machine into a fleet: all that its node must know before it has heard anybody.
 
 Knows: the fields of an invitation, that it is whole, that its parts fit each other. Does not know: its writer
-(`zsched.commands.invite`), what becomes of it on the new machine (`zsched.commands.members.belongings`).
+(`zsched.commands.members.membership`), what becomes of it on the new machine (`zsched.commands.members.belongings`).
 
 It is JSON, so that an operator can read it. A node that is new must be told the generation that it joins: of two fleets
 of one name it could not know which is meant.

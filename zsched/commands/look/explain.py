@@ -387,7 +387,7 @@ def _tuning(page: Page, body: Json) -> None:
 def formula_of(body: Json) -> str:
     """How the terms of a robot's row make its utility, in the names of the columns; empty: nothing is measured.
 
-    A metric that nobody measured has no part in it (`zsched.core.scheduler.utility.total_utility`).
+    A metric that nobody measured has no part in it (`zsched.core.scheduler.utility.Total`).
     """
     views = [view for one in body["candidates"] for view in one["robots"]]
     weights = {

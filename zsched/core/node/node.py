@@ -1,8 +1,8 @@
 """The one door: `Node.handle` takes what happened and returns what to do; nothing else changes a node's state.
 
 Knows: how the six stages follow each other, and the order of a batch (persist, then send, then apply). Does not know:
-what each event means (`zsched.core.node`), clocks, random sources, sockets, files, processes; time
-and the generator are passed in.
+what each event means (the handlers beside it), clocks, random sources, sockets, files, processes; time and the
+generator are passed in.
 
 After the event is absorbed, `_advance` lets every stage act on the time that has passed, in the order in which the data
 flows: PROFILE, GATEWAY, SCHEDULER, VOTE, EXECUTOR, ROUTE. Our own profile, utility and proposal enter by the same

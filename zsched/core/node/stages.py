@@ -1,7 +1,7 @@
 """What one daemon consists of: the six stages, membership beside them, and what they share.
 
 Knows: which parts there are, and what is asked of several of them together. Does not know: what an event means to them
-(`zsched.core.node`), in which order they act (`zsched.core.node.node`).
+(the handlers beside it), in which order they act (`zsched.core.node.node`).
 """
 
 from __future__ import annotations

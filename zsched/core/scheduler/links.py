@@ -4,7 +4,7 @@ Knows: links that were measured directly, the two ways of a pair that meet at an
 has measured yet. Does not know: weights, who may have the task, how signals are smoothed.
 
 Whether a candidate is *reached* is always a matter of the weaker way as measured: a path with a dead end is dead.
-What it is *worth* is told by the candidate's own way.
+Its *worth* is told by the candidate's own way.
 """
 
 from __future__ import annotations

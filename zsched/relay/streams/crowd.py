@@ -1,6 +1,6 @@
 """Puts a stream's outputs to all its applications, and leaves behind the one that takes too little.
 
-Knows: whose link has room (`zsched.link.sessions.link_sockets`), which sessions are workers, when to wait.
+Knows: whose link has room (`zsched.link.sessions.link_sockets`), which sessions are workers', when to wait.
 Does not know: zenoh's queues, which stream this is, who of those that are linked receives it: whose link fills up
 receives something.
 
